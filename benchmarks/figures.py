@@ -231,8 +231,7 @@ def scenes_table(rows: Sequence[Row]) -> str:
         return f"{megabytes(size)} MB, {ratio:.1f}x, {cpu:.0f} s"
 
     return table(
-        ("command", *SHOWN),
-        ((f"`{command}`", *(cell(name, command) for name in SHOWN)) for command in EFFORTS),
+        ("command", *SHOWN), ((f"`{command}`", *(cell(name, command) for name in SHOWN)) for command in EFFORTS)
     )
 
 

@@ -367,11 +367,7 @@ def main() -> int:
             continue
         tally = fuzz(kind, options.first, options.tries or round(options.part * kind.tries), keep=options.keep)
         tallies.append(tally)
-        print(
-            f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}",
-            file=sys.stderr,
-            flush=True,
-        )
+        print(f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}", file=sys.stderr, flush=True)
         print("\n".join(tally.failures), end="\n" if tally.failures else "", file=sys.stderr, flush=True)
     print(table(tallies, (time.process_time() - started) / 60))
     return int(any(tally.failures for tally in tallies))

@@ -21,8 +21,7 @@ import numpy as np
 from benchmarks.harness import SCENES, Timer, check
 from benchmarks.moved_scene import Similarity
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.inria import inria_json
-from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.read import inria_json, read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.io.ply import PlySource, write_ply
@@ -70,7 +69,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
             return found
 
     def recording(options: CompressOptions, coder: GridCoder) -> Any:
-        make = grid_maker(options, coder, Recorded)
+        make = grid_maker(options, coder)
 
         def recorded(*given: Any) -> Any:
             maker = make(*given)
@@ -80,7 +79,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
 
         return recorded
 
-    with mock.patch("flexgs_edge.methods.best.method.grid_maker", recording):
+    made = "flexgs_edge.methods.best.method"
+    with mock.patch(f"{made}.grid_maker", recording), mock.patch(f"{made}.GridMaker", Recorded):
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = next(step for step in steps if step.measurement == result.search.chosen.measurement)

@@ -57,7 +57,7 @@ __kernel void peak(const uint rounds, __global const float *records, __global fl
 
 def bench_peak(timer: Timer, backend: OpenCLBackend) -> float:
     """Measure the lanes a second of the arithmetic alone, on all cores."""
-    session, width = backend.session, backend.width
+    session, width = backend, backend.width
     source = load_source("dequantize.cl") + ARITHMETIC  # the file brings constants and helpers
     kernel = session.kernel(source, "peak", (f"-DW={width}",), "ubb")
     records = np.zeros((SPLATS, 16), np.float32)
@@ -68,8 +68,8 @@ def bench_peak(timer: Timer, backend: OpenCLBackend) -> float:
     backend.write(held, records)
 
     def run() -> None:
-        session.launch("peak", kernel, (ITEMS,), (1,), (ROUNDS, held, out))
-        session.finish()
+        session.enqueue("peak", kernel, (ITEMS,), (1,), (ROUNDS, held, out))
+        session.close()
 
     run()
     sums = backend.read(out)

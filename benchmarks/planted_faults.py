@@ -166,12 +166,7 @@ MUTATIONS = (
     Mutation("sign in the area before dilation", "project.cl", "nz = fma(g00, g11, -(", "nz = fma(g00, g11, ("),
     Mutation("factor's rows not made orthogonal", "activate.clh", "m20 = fma(-yz, ux, m20)", "m20 = m20"),
     Mutation("determinant not checked", "project.cl", "MASK(det < (FW)INFINITY)", "MASK(det == det)"),
-    Mutation(
-        "hit counted on the splat that ends",
-        "common.clh",
-        "return hit;",
-        "return seen & MASK(t > (FW)0.0f);",
-    ),
+    Mutation("hit counted on the splat that ends", "common.clh", "return hit;", "return seen & MASK(t > (FW)0.0f);"),
     Mutation("ended pixels go on", "common.clh", "pick(seen, -fabs(t), t)", "t"),
     Mutation(
         "the splat that ends is blended",

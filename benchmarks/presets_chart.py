@@ -40,7 +40,6 @@ def chart(rows: list[Row]) -> LineChart:
         "times smaller than the PLY",
         tuple(series),
         log_x=True,
-        log_y=True,
     )
 
 

@@ -11,7 +11,7 @@ from collections import defaultdict
 import numpy as np
 
 from benchmarks.harness import SCENES, Timer, backend_of, check, parse
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.model_folder import find_companions
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores

@@ -13,10 +13,10 @@ from collections import defaultdict
 import numpy as np
 
 from benchmarks.harness import Timer, backend_of, check, parse
+from benchmarks.view import STAGES
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.studies.speed.timing import STAGES
 
 COUNT, WIDTH, HEIGHT, FOCAL = 1_000_000, 1280, 720, 1000.0
 SIGMA, OPACITY, SEED = 2.0, 0.3, 0

@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks.parts import MOST_PARTS, PartsSource
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.inria import inria_json
-from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.read import inria_json, read_cameras
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.run.companions import companions_of

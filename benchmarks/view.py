@@ -24,8 +24,14 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.studies.speed.timing import STAGES
 
+STAGES = {
+    "projection": ("project",),
+    "sort": ("sort_count_first", "sort_scatter_first", "sort_count", "sort_scatter", "exclusive_scan"),
+    "tile lists": ("tile_room", "tile_count", "tile_scatter"),
+    "blend": ("blend",),
+}
+"""Kernels of each stage of a view. The short scans of the tile lists count as sorting."""
 VIEWS = 10
 
 

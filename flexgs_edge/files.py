@@ -29,17 +29,8 @@ _SPECIAL = {
 def check_readable(path: str | os.PathLike[str], name: str | None = None) -> None:
     """Check that a path is a file. It is not opened: a pipe without a writer would wait for ever.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    name : str, optional
-        The path for messages. Default: `path`.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is not a regular one.
+    `path`: the file. `name`: the path for messages. Default: `path`. Raises `InputError` if there is no such file, or
+    it is not a regular one.
     """
     name = os.fspath(path) if name is None else name
     try:
@@ -60,10 +51,7 @@ def check_readable(path: str | os.PathLike[str], name: str | None = None) -> Non
 def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
     """Check, before any work is done, that a file can be written; returns its place with links followed.
 
-    Raises
-    ------
-    InputError
-        If the folder is missing, `path` is not a regular file, or it exists and `force` is not set.
+    Raises `InputError` if the folder is missing, `path` is not a regular file, or it exists and `force` is not set.
     """
     target = Path(os.path.realpath(path))
     try:
@@ -87,19 +75,8 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
     The file can be read and seeked. After any error (Ctrl-C included), no partial file is left, and an earlier file of
     that name stays as it was.
 
-    Parameters
-    ----------
-    path : path
-        Place of the finished file; a symbolic link is followed.
-    force : bool, optional
-        Replace an existing file.
-
-    Raises
-    ------
-    InputError
-        If `path` cannot be written to (see `check_writable`).
-    BudgetError
-        If the disk is full.
+    `path`: place of the finished file; a symbolic link is followed. `force`: replace an existing file. Raises
+    `InputError` if `path` cannot be written to (see `check_writable`). Raises `BudgetError` if the disk is full.
     """
     target = check_writable(path, force)
     # A random, short name: two runs never share it, and it fits where a long target name with a suffix would not.
@@ -125,10 +102,7 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
 def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
     """Check, before any work is done, that a folder can be written; returns its place with links followed.
 
-    Raises
-    ------
-    InputError
-        If its parent is missing, `path` is not a folder, or it is not empty and `force` is not set.
+    Raises `InputError` if its parent is missing, `path` is not a folder, or it is not empty and `force` is not set.
     """
     target = Path(os.path.realpath(path))
     try:

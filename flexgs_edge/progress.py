@@ -12,10 +12,7 @@ T = TypeVar("T")
 class Progress:
     """Shows progress bars on stderr, or none.
 
-    Parameters
-    ----------
-    enabled : bool, optional
-        Show bars. By default, only if stderr is a terminal.
+    `enabled`: show bars. By default, only if stderr is a terminal.
     """
 
     def __init__(self, enabled: bool | None = None) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 
 _MOST_STEPS = 60
 """Steps halve large singular values, then square the distance from 1. So 60 are enough for 1e-12 of the largest."""
-_SMALL_STEP = 1e-12
-"""A smaller step leaves an error of less than its square, which no digit shows."""
+_SMALL_STEP = 1e-12  # A smaller step leaves an error of less than its square, which no digit shows
 
 
 def product(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:

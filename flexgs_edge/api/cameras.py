@@ -51,11 +51,7 @@ class Cameras(Sequence[Camera]):
 
     @classmethod
     def from_matrices(
-        cls,
-        world_to_camera: ArrayLike,
-        intrinsics: ArrayLike,
-        sizes: ArrayLike,
-        names: Sequence[str] | None = None,
+        cls, world_to_camera: ArrayLike, intrinsics: ArrayLike, sizes: ArrayLike, names: Sequence[str] | None = None
     ) -> Cameras:
         """Make V cameras from matrices, such as those of COLMAP, OpenCV or gsplat.
 

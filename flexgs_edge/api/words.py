@@ -34,7 +34,7 @@ class Arrays(TypedDict):
 
 
 class CompressWords(TypedDict, total=False):
-    """Single options of `compress`. `CompressOptions` explains each."""
+    """Single options of `compress`. `flexgs-edge compress --expert` explains each."""
 
     ignore_distortion: bool
     dataparser: str | None

@@ -22,41 +22,24 @@ class Camera:
 
     Camera space is COLMAP's (x right, y down, z forward); the centre of the first pixel is (0, 0).
 
-    Parameters
-    ----------
-    name : str
-        Photos are matched, and views sorted, by this name.
-    width, height : int
-        Pixels.
-    rotation : np.ndarray
-        [3, 3] f64, world to camera.
-    translation : np.ndarray
-        [3] f64, scene units.
-    fx, fy : float
-        Focal lengths, pixels.
-    cx, cy : float
-        Principal point, pixels, integer pixel centres: (W - 1) / 2 is the middle.
-    distortion : str, optional
-        Why photos of this camera do not match its renders: a lens distortion that was ignored, or an assumed field of
-        view. The pose serves for scores.
-    lens : Lens, optional
-        The lens of its photos, which are freed of it when they are loaded.
-    dilation : float
-        Added to both diagonal terms of the 2D covariance, px^2.
+    `width`, `height`: pixels. `fx`, `fy`: focal lengths, pixels. `cx`, `cy`: principal point, pixels, integer pixel
+    centres: (W - 1) / 2 is the middle.
     """
 
-    name: str
+    name: str  # photos are matched, and views sorted, by this name
     width: int
     height: int
-    rotation: np.ndarray
-    translation: np.ndarray
+    rotation: np.ndarray  # [3, 3] f64, world to camera
+    translation: np.ndarray  # [3] f64, scene units
     fx: float
     fy: float
     cx: float
     cy: float
+    # Why photos of this camera do not match its renders: a lens distortion that was ignored, or an assumed field of
+    # view. The pose serves for scores.
     distortion: str | None = None
-    lens: Lens | None = None
-    dilation: float = DILATION
+    lens: Lens | None = None  # the lens of its photos, which are freed of it when they are loaded
+    dilation: float = DILATION  # added to both diagonal terms of the 2D covariance, px^2
 
     def __post_init__(self) -> None:
         for field, shape in (("rotation", (3, 3)), ("translation", (3,))):
@@ -142,12 +125,7 @@ def distinct_names(names: Sequence[str]) -> list[str]:
 def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], list[int]]:
     """Split views into those to train on and those held out, as indices into the list sorted by name.
 
-    Parameters
-    ----------
-    count : int
-        Number of views.
-    holdout : int, optional
-        Every `holdout`-th view (index % holdout == 0) is held out; 0 holds out none.
+    `count`: number of views. `holdout`: every `holdout`-th view (index % holdout == 0) is held out; 0 holds out none.
 
     >>> split_views(5, 2)
     ([1, 3], [0, 2, 4])
@@ -162,12 +140,8 @@ def split_views(count: int, holdout: int = DEFAULT_HOLDOUT) -> tuple[list[int], 
 def limit_width(cameras: Sequence[Camera], max_width: int) -> tuple[list[Camera], str | None]:
     """Scale views wider than `max_width` pixels down to this width, with the same aspect.
 
-    Returns
-    -------
-    cameras : list of Camera
-        In the same order. Heights are rounded down, as in the reference training program.
-    note : str or None
-        How many views were scaled, for the summary.
+    Returns `cameras`: In the same order. Heights are rounded down, as in the reference training program. `note`: How
+    many views were scaled, for the summary.
     """
     if max_width < 1:
         raise InputError(f"--resolution {max_width}: expected a width of at least 1 pixel")

@@ -20,23 +20,12 @@ from flexgs_edge.errors import FormatError, InputError
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model of COLMAP.
-
-    Parameters
-    ----------
-    name : str
-    focals : int
-        Number of focal lengths at the front of the parameters, 1 or 2; the principal point follows.
-    count : int
-        Number of all parameters; those after the principal point describe the lens.
-    fisheye : bool
-        The lens is no pinhole, even if its parameters are zero.
-    """
+    """A camera model of COLMAP."""
 
     name: str
-    focals: int
-    count: int
-    fisheye: bool = False
+    focals: int  # number of focal lengths at the front of the parameters, 1 or 2; the principal point follows
+    count: int  # number of all parameters; those after the principal point describe the lens
+    fisheye: bool = False  # the lens is no pinhole, even if its parameters are zero
 
 
 MODELS: dict[int, Model] = dict(
@@ -56,8 +45,7 @@ MODELS: dict[int, Model] = dict(
             Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 16, True),
         )
     )
-)
-"""Camera models by COLMAP's model id."""
+)  # Camera models by COLMAP's model id
 
 LENSES: dict[str, Callable[[tuple[float, ...]], Lens]] = {
     **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL"), Lens),
@@ -116,19 +104,10 @@ def read_colmap(path: str | os.PathLike[str], ignore_distortion: bool = False) -
 
     COLMAP's pixel centres lie at integer + 0.5, so half a pixel is subtracted from the principal point.
 
-    Parameters
-    ----------
-    path : path
-        The folder of the model, its parent, or the folder that holds `sparse/0`.
-    ignore_distortion : bool, optional
-        Take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or cannot be read.
-    FormatError
-        If a file breaks the format; the message names file and camera, image, line or byte.
+    `path`: the folder of the model, its parent, or the folder that holds `sparse/0`. `ignore_distortion`: take the
+    poses of distorted lenses as pinholes; such cameras cannot be compared with photos. Raises `InputError` if a file is
+    missing or cannot be read. Raises `FormatError` if a file breaks the format; the message names file and camera,
+    image, line or byte.
     """
     folder = find_model(Path(path))
     if folder is None:

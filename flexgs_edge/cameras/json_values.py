@@ -13,21 +13,14 @@ from flexgs_edge.errors import FormatError, InputError, brief
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of |R R^T - 1|. Files keep 6 digits or more; a scaled or sheared matrix is off by far more."""
-MAX_SIDE = 65535
-"""Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)."""
-_SHOWN = 20
-"""Most keys in a message."""
+MAX_SIDE = 65535  # Most pixels of a side; a larger number means a damaged file (JPEG has this limit too)
+_SHOWN = 20  # Most keys in a message
 
 
 def load_json(path: Path) -> Any:
     """Load the value of a JSON file.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it is not JSON.
+    Raises `InputError` if the file cannot be read. Raises `FormatError` if it is not JSON.
     """
     try:
         return json.loads(path.read_bytes())
@@ -48,12 +41,7 @@ def kind(value: Any) -> str:
 class Entry:
     """One object of a file, with its place for messages; every method raises `FormatError`.
 
-    Parameters
-    ----------
-    place : str
-        Such as "cameras.json: camera 3".
-    entry : Any
-        Must be an object.
+    `place`: such as "cameras.json: camera 3". `entry`: must be an object.
     """
 
     def __init__(self, place: str, entry: Any) -> None:

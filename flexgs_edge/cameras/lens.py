@@ -7,10 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-_BLOCK = 64
-"""Rows that are resampled at a time."""
-_EDGE = 65
-"""Places along each edge, and along each ray, where `fitted` looks."""
+_BLOCK = 64  # Rows that are resampled at a time
+_EDGE = 65  # Places along each edge, and along each ray, where `fitted` looks
 _ZOOMS = np.arange(1.0, 2.0, 0.002)
 
 
@@ -19,23 +17,12 @@ class Lens:
     """A lens, and the zoom of the pinhole camera that takes its place.
 
     Source: https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html and its module fisheye.
-
-    Parameters
-    ----------
-    radial : tuple of float
-        OpenCV's k1 to k6 (the last three divide), or the fisheye's k1 to k4.
-    tangential : tuple of float
-        p1 and p2; not for a fisheye.
-    fisheye : bool
-        The radial polynomial is of the angle to the axis.
-    zoom : float
-        Focal length of the pinhole over that of the lens.
     """
 
-    radial: tuple[float, ...]
-    tangential: tuple[float, float] = (0.0, 0.0)
-    fisheye: bool = False
-    zoom: float = 1.0
+    radial: tuple[float, ...]  # OpenCV's k1 to k6 (the last three divide), or the fisheye's k1 to k4
+    tangential: tuple[float, float] = (0.0, 0.0)  # p1 and p2; not for a fisheye
+    fisheye: bool = False  # the radial polynomial is of the angle to the axis
+    zoom: float = 1.0  # focal length of the pinhole over that of the lens
 
     def bent(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the lens shows points of the plane at distance 1, in the same units (all arrays f64 of one shape)."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 
-DIGITS = 8
-"""Decimals in comparisons of squared distances, so that rounding does not break ties."""
+DIGITS = 8  # Decimals in comparisons of squared distances, so that rounding does not break ties
 BESIDE_EACH_OTHER = 2.0
 """Squared distance of two directions at a right angle. A camera that is farther turned looks the other way."""
 

@@ -18,15 +18,11 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.small_matrices import product
 
 DATAPARSER = "dataparser_transforms.json"
-LEVELS = 4
-"""Folders above the data, or above a PLY, that are searched."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Turns OpenGL's camera (y up, looking along -z) into COLMAP's."""
+LEVELS = 4  # Folders above the data, or above a PLY, that are searched
+FLIP = np.diag([1.0, -1.0, -1.0])  # Turns OpenGL's camera (y up, looking along -z) into COLMAP's
 ASSUMED_SIZE = (640, 480)
-ASSUMED_VIEW = 65.0
-"""Degrees across the image, where a list of poses has no focal length."""
-_CONFIG_LIMIT = 1 << 20
-"""Most bytes of config.yml that are searched for the name of the data."""
+ASSUMED_VIEW = 65.0  # Degrees across the image, where a list of poses has no focal length
+_CONFIG_LIMIT = 1 << 20  # Most bytes of config.yml that are searched for the name of the data
 
 
 def find_dataparser(path: Path) -> Path | None:
@@ -35,10 +31,7 @@ def find_dataparser(path: Path) -> Path | None:
     It lies beside the file, or in nerfstudio's `outputs/EXPERIMENT/METHOD/TIME` in the data's folder or up to LEVELS above
     it. There, the experiment or its config.yml must name the data's folder.
 
-    Raises
-    ------
-    InputError
-        If there are several that differ.
+    Raises `InputError` if there are several that differ.
     """
     if path.with_name(DATAPARSER).is_file():
         return path.with_name(DATAPARSER)
@@ -90,12 +83,8 @@ def cameras_of_poses(path: Path, value: Sequence[Any], like: Sequence[Camera]) -
     The list has neither sizes nor focal lengths. They are taken from the camera in `like` with the same file name, or from
     all of `like` if they are equal. Without `like`, a view of ASSUMED_VIEW degrees is assumed: photos cannot be compared.
 
-    Raises
-    ------
-    FormatError
-        If an entry is wrong; the message names it.
-    InputError
-        If `like` has cameras, but none that fits.
+    Raises `FormatError` if an entry is wrong; the message names it. Raises `InputError` if `like` has cameras, but none
+    that fits.
     """
     entries = [Entry(f"{path}: camera {index}", entry) for index, entry in enumerate(value)]
     files = [PurePosixPath(entry.name("file_path").replace("\\", "/")) for entry in entries]

@@ -1,4 +1,4 @@
-"""Order cameras so that the first ones of any number cover the whole scene: by what they see, or by where they are."""
+"""Order cameras so that the first ones of any number cover the whole scene, by what they see."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.small_matrices import product
 
-DIGITS = 6
-"""Decimals in comparisons of squared distances, so that rounding in a scene that was moved does not break ties of a
-rig."""
-GAIN_DIGITS = 4
-"""Decimals in comparisons of what a camera adds, as a share of all points."""
+GAIN_DIGITS = 4  # Decimals in comparisons of what a camera adds, as a share of all points
 SAME_VIEW = 0.2
 """Two views of a point overlap if the cosine between their directions differs from 1 by less than this: up to 37
 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
@@ -26,15 +22,8 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
     for every chosen camera that has it from a near direction: 1 / (1 + sum of max(0, 1 - (1 - cosine) / `SAME_VIEW`)).
     Ties go to the lower index.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-    points : np.ndarray
-        [3, n] f64, a sample of the scene's positions, world coordinates.
-    near : float
-        Near plane, scene units.
-    count : int
-        Most cameras to choose.
+    `points`: [3, n] f64, a sample of the scene's positions, world coordinates. `near`: near plane, scene units.
+    `count`: most cameras to choose.
     """
     if not cameras:
         return []
@@ -59,38 +48,3 @@ def in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside: np.ndarray = (z > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return inside
-
-
-def farthest_order(cameras: Sequence[Camera]) -> list[int]:
-    """Order all cameras so that each next one is farthest from those before; the first is nearest to their middle.
-
-    The distance of two cameras has two parts, whose squares are added. The first is the distance of their places, over
-    the mean distance from the middle. The second is the distance of their directions (opposite ones are 2 apart), over
-    the same mean of directions. So neither a ring of cameras that look inwards nor a turning tripod counts as one
-    place. Ties go to the lower index.
-
-    >>> from types import SimpleNamespace
-    >>> line = [SimpleNamespace(center=np.array([x, 0.0, 0.0]), rotation=np.eye(3)) for x in (0.0, 1.0, 2.0, 3.0, 4.0)]
-    >>> farthest_order(line)
-    [2, 0, 4, 1, 3]
-    """
-    if not cameras:
-        return []
-    places = _spread(np.array([camera.center for camera in cameras]))
-    points = np.hstack([places, _spread(np.array([camera.rotation[2] for camera in cameras]))])
-    order = [int(np.argmin(np.square(points).sum(axis=1).round(DIGITS)))]
-    nearest = np.full(len(points), np.inf)
-    nearest[order] = -1.0
-    while len(order) < len(points):
-        nearest = np.minimum(nearest, np.square(points - points[order[-1]]).sum(axis=1))
-        nearest[order] = -1.0
-        order.append(int(np.argmax(nearest.round(DIGITS))))
-    return order
-
-
-def _spread(points: np.ndarray) -> np.ndarray:
-    """[n, 3], the points relative to their middle, in units of their mean distance from it."""
-    moved = points - points.mean(axis=0)
-    unit = float(np.sqrt(np.square(moved).sum(axis=1)).mean())
-    # If all points are in one place, rounding must not decide.
-    return moved / unit if unit > 1e-9 * (1.0 + float(np.abs(points).max())) else np.zeros_like(moved)

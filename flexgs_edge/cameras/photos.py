@@ -26,8 +26,7 @@ _SHOWN = 5
 # Errors of Pillow for damaged files, besides OSError (the base of its errors for truncated and unknown files).
 _DAMAGED = (OSError, SyntaxError, ValueError, EOFError, struct.error, OverflowError)
 
-Size = tuple[int, int]
-"""Width and height in pixels."""
+Size = tuple[int, int]  # Width and height in pixels
 
 
 class Photos:
@@ -35,14 +34,9 @@ class Photos:
 
     Made by `Photos.open` or `Photos.of_arrays`.
 
-    Attributes
-    ----------
-    cameras : list of Camera
-        Those with photos, in the given order, scaled to the photos (and to the width limit).
-    paths : list of Path
-        The photo of each camera (for messages, where they are arrays).
-    notes : tuple of str
-        Notes on photos that were scaled or undistorted, or are missing, for the summary.
+    `cameras`: those with photos, in the given order, scaled to the photos (and to the width limit). `paths`: the photo
+    of each camera (for messages, where they are arrays). `notes`: notes on photos that were scaled or undistorted, or
+    are missing, for the summary.
     """
 
     def __init__(
@@ -54,29 +48,17 @@ class Photos:
     @classmethod
     def open(
         cls,
-        images_dir: str | os.PathLike[str],
-        cameras: Sequence[Camera],
+        images_dir: str | os.PathLike[str],  # folder of JPEG, PNG, WebP or TIFF files
+        cameras: Sequence[Camera],  # names are file names with or without extension
         background: Sequence[float] = (0.0, 0.0, 0.0),
         max_width: int | None = None,
     ) -> Photos:
         """Find the photo of every camera, and check its size. A few cameras without photos are left out (see `notes`).
 
-        Parameters
-        ----------
-        images_dir : path
-            Folder of JPEG, PNG, WebP or TIFF files.
-        cameras : sequence of Camera
-            Names are file names with or without extension.
-        background : sequence of float, optional
-            Red, green, blue in [0, 1] behind photos with an alpha channel; black by default.
-        max_width : int, optional
-            Wider photos, and their cameras, are scaled down to this width. No limit by default.
-
-        Raises
-        ------
-        InputError
-            If the folder or half of the photos are missing, a photo is damaged, photos cannot be told apart, or sizes do
-            not match the cameras.
+        `background`: red, green, blue in [0, 1] behind photos with an alpha channel; black by default. `max_width`:
+        wider photos, and their cameras, are scaled down to this width. No limit by default. Raises `InputError` if the
+        folder or half of the photos are missing, a photo is damaged, photos cannot be told apart, or sizes do not match
+        the cameras.
         """
         folder = Path(images_dir)
         _refuse_bent(folder, cameras)
@@ -141,10 +123,7 @@ class Photos:
     def load(self, index: int) -> np.ndarray:
         """Read the photo of camera `index`: [H, W, 3] f32 in [0, 1], at the camera's size.
 
-        Raises
-        ------
-        InputError
-            If the photo is damaged, or its kind of pixels has no colours in [0, 1].
+        Raises `InputError` if the photo is damaged, or its kind of pixels has no colours in [0, 1].
         """
         from PIL import Image
 

@@ -27,8 +27,7 @@ from flexgs_edge.small_matrices import product
 
 LOG = logging.getLogger("flexgs_edge")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-"""Values of `camera_model` without a lens."""
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")  # Values of `camera_model` without a lens
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of `camera_model` that are pinholes if their parameters are zero."""
 
@@ -42,21 +41,10 @@ def read_transforms(
     integer + 0.5, so half a pixel is subtracted from the principal point; by default it is the image's middle. If the
     size is missing, it is taken from the frame's photo (`file_path` with or without extension).
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    ignore_distortion : bool, optional
-        Take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
-    dataparser : path, optional
-        A `dataparser_transforms.json`. Default: the one that is found.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a size is not found.
-    FormatError
-        If the file breaks its format; the message names file, frame and key.
+    `path`: the file. `ignore_distortion`: take the poses of distorted lenses as pinholes; such cameras cannot be
+    compared with photos. `dataparser`: a `dataparser_transforms.json`. Default: the one that is found. Raises
+    `InputError` if the file cannot be read, or a size is not found. Raises `FormatError` if the file breaks its format;
+    the message names file, frame and key.
     """
     path = Path(path)
     return cameras_of_frames(path, load_json(path), ignore_distortion, dataparser)

@@ -32,10 +32,8 @@ COMMANDS = {
     "score": "Save the importance of every Gaussian, for --method paper.",
     "study": "Run experiments on your own scenes: tables and charts.",
     "devices": "List the OpenCL devices, and say which one is used.",
-}
-"""Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand."""
-REPEAT_SECONDS = 1.0
-"""`timeout` sends its signal twice: to the program, and to its process group."""
+}  # Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand.
+REPEAT_SECONDS = 1.0  # `timeout` sends its signal twice: to the program, and to its process group
 
 
 @click.group(

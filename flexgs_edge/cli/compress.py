@@ -37,8 +37,7 @@ USUAL = (
     "dry_run",
     "force",
     "quiet",
-)
-"""Options that `--help` shows, in order. `--expert` shows the others too."""
+)  # Options that `--help` shows, in order. `--expert` shows the others too.
 MORE = """\b
 More examples:
   flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
@@ -74,11 +73,7 @@ Several scenes:
     help="Smallest file that loses at most DB of PSNR against the photos. Without photos the loss is estimated.",
 )
 @option(
-    REACH,
-    "--min-fidelity",
-    metavar="DB",
-    type=float,
-    help="Smallest file with this PSNR to the original's renders.",
+    REACH, "--min-fidelity", metavar="DB", type=float, help="Smallest file with this PSNR to the original's renders."
 )
 @option(
     REACH,
@@ -103,13 +98,7 @@ Several scenes:
     help="whole: also bound the worst view, SSIM and made poses. mean: the target alone, by the mean of the views.",
 )
 @option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
-@option(
-    REACH,
-    "--min-ratio",
-    metavar="R",
-    type=float,
-    help="Best quality in 1/R of the scene's bytes as a .ply.",
-)
+@option(REACH, "--min-ratio", metavar="R", type=float, help="Best quality in 1/R of the scene's bytes as a .ply.")
 @option(REACH, "--max-gaussians", metavar="N", type=int, help="Keep at most N Gaussians, whatever the target allows.")
 @option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
 @shared_options.reading_options
@@ -161,12 +150,7 @@ Several scenes:
     "pip install 'flexgs-edge[cluster]'. The bytes stay the same.",
 )
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")
-@option(
-    OUTPUT,
-    "--format",
-    metavar="SUFFIX",
-    help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.",
-)
+@option(OUTPUT, "--format", metavar="SUFFIX", help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.")
 @shared_options.spz_version_option
 @shared_options.positions_options
 @option(

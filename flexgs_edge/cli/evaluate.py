@@ -12,11 +12,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
 @help_page.option(
-    "Quality",
-    "--against",
-    metavar="REF",
-    required=True,
-    help="The original (REF): any scene file or model folder.",
+    "Quality", "--against", metavar="REF", required=True, help="The original (REF): any scene file or model folder."
 )
 @help_page.option(
     "Quality",

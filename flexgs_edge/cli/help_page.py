@@ -15,8 +15,7 @@ EFFORT = "Effort"
 DEVICE = "Memory and device"
 MACHINES = "Memory and machines"
 OUTPUT = "Output"
-METHOD = "Method"
-"""Heading of options that only one `--method` knows. The name of the method follows it."""
+METHOD = "Method"  # Heading of options that only one `--method` knows. The name of the method follows it.
 FAULTS = "Faults"
 HELP = "Help"
 
@@ -24,8 +23,7 @@ _LAST = (INPUT, VIEWS, EFFORT, DEVICE, MACHINES, OUTPUT, METHOD, f"{METHOD} best
 """Order of the headings that commands share. A command's own headings come before them."""
 _NAMES_WIDTH = 22
 """Width of the column of option names. A longer name gets its own line, so that texts keep their width."""
-_EXPERT = "flexgs_edge.expert"
-"""Key in `meta` of a context that says whether `--expert` was given."""
+_EXPERT = "flexgs_edge.expert"  # Key in `meta` of a context that says whether `--expert` was given
 
 
 class SectionOption(click.Option):
@@ -94,12 +92,8 @@ class SectionCommand(click.Command):
 class ExpertCommand(SectionCommand):
     """A command with many options: `--help` shows the common ones, `--expert` shows all.
 
-    Parameters
-    ----------
-    usual : sequence of str
-        Names of the parameters that `--help` shows, in order.
-    more : str
-        Text that `--expert` shows below the options.
+    `usual`: names of the parameters that `--help` shows, in order. `more`: text that `--expert` shows below the
+    options.
     """
 
     def __init__(self, *args: Any, usual: Sequence[str], more: str, **kwargs: Any) -> None:

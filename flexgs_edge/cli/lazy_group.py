@@ -12,10 +12,8 @@ import click
 class LazyGroup(click.Group):
     """A group that knows the names of its subcommands, and imports a subcommand only to run it.
 
-    Parameters
-    ----------
-    commands_from : tuple
-        A package with one module per subcommand, each of which defines `command`; and the overview's line for each name.
+    `commands_from`: a package with one module per subcommand, each of which defines `command`; and the overview's line
+    for each name.
     """
 
     def __init__(self, *args: Any, commands_from: tuple[str, Mapping[str, str]], **kwargs: Any) -> None:

@@ -32,8 +32,7 @@ reading_options = stack(
         type=int,
         help="Leave out view-dependent colour (SH) above degree N. Default: keep all.",
     ),
-)
-"""Options of every command that reads a scene with its values."""
+)  # Options of every command that reads a scene with its values
 spz_version_option = option(
     OUTPUT,
     "--spz-version",
@@ -188,18 +187,9 @@ memory_option = option(
     help="Most memory for the run, such as 600MiB or 2GB. Less is slower. Default: 3/4 of the free memory.",
 )
 force_option = option(OUTPUT, "-f", "--force", is_flag=True, help="Overwrite files that exist.")
-report_option = option(
-    OUTPUT,
-    "--report",
-    metavar="DIR",
-    help="Write a page about the result: DIR/index.html.",
-)
+report_option = option(OUTPUT, "--report", metavar="DIR", help="Write a page about the result: DIR/index.html.")
 json_option = option(
-    OUTPUT,
-    "--json",
-    "json_path",
-    metavar="FILE",
-    help="Write the result as JSON to FILE; - is stdout.",
+    OUTPUT, "--json", "json_path", metavar="FILE", help="Write the result as JSON to FILE; - is stdout."
 )
 quiet_option = option(OUTPUT, "-q", "--quiet", is_flag=True, help="Show no log and no progress bars.")
 debug_option = option(
@@ -211,12 +201,10 @@ debug_option = option(
     callback=set_debug,
     help="Show tracebacks of errors.",
 )
-write_options = stack(json_option, force_option, quiet_option, debug_option)
-"""Options of every command."""
+write_options = stack(json_option, force_option, quiet_option, debug_option)  # Options of every command
 run_options = stack(memory_option, device_option, write_options)
 """Options of every command that uses a device and writes a file."""
-photos_options = stack(cameras_option, images_option, holdout_option)
-"""Options for cameras, photos and held-out views."""
+photos_options = stack(cameras_option, images_option, holdout_option)  # Options for cameras, photos and held-out views
 study_options = stack(
     reading_options,
     photos_options,
@@ -226,9 +214,7 @@ study_options = stack(
     base_psnr_option,
     drop_invalid_option,
     run_options,
-)
-"""Options of every study."""
+)  # Options of every study
 results_option = option(
     OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
-)
-"""Options for the output of a study."""
+)  # Options for the output of a study

@@ -24,8 +24,7 @@ MAGIC = b"\x93FGS\r\n\x1a\n"
 them."""
 _PREAMBLE = struct.Struct("<8sHHIQII")
 _U32 = struct.Struct("<I")
-_PIECE = 1 << 20
-"""Bytes read at a time to compute a checksum."""
+_PIECE = 1 << 20  # Bytes read at a time to compute a checksum
 
 _Header = TypeVar("_Header")
 
@@ -51,10 +50,7 @@ def preamble(version: int, size: int, block: bytes) -> bytes:
 class SectionFile:
     """A `.fgs` file of one version.
 
-    Parameters
-    ----------
-    path : path
-        The file is opened for each read, and never held open.
+    `path`: the file is opened for each read, and never held open.
     """
 
     version: int
@@ -110,19 +106,13 @@ class SectionFile:
         file: BinaryIO,
         size: int,
         wrong_length: Callable[[int, int], str],
-        decode: Callable[[bytes], _Header],
+        decode: Callable[[bytes], _Header],  # makes a header from its bytes; raises `HeaderError`
         wrong_size: Callable[[_Header], str],
     ) -> _Header:
         """Read and check the header of a file of `size` bytes.
 
-        Parameters
-        ----------
-        wrong_length : callable
-            The fault of a header's length, given the room for it; "" if there is none.
-        decode : callable
-            Makes a header from its bytes; raises `HeaderError`.
-        wrong_size : callable
-            The size that the header implies, in words, if the file has another size; else "".
+        `wrong_length`: the fault of a header's length, given the room for it; "" if there is none. `wrong_size`: the
+        size that the header implies, in words, if the file has another size; else "".
         """
         start = self._read(file, PREAMBLE_BYTES, "preamble")
         magic, version, required, _, claimed, block_bytes, block_sum = _PREAMBLE.unpack_from(start)
@@ -171,12 +161,8 @@ class SectionFile:
 class Verification:
     """Collects the sections of a file, each with the result of its check.
 
-    Parameters
-    ----------
-    block : int
-        Bytes of the header, which has been read.
-    raise_errors : bool
-        If False, report damage as `ok=False` instead of raising an error.
+    `block`: bytes of the header, which has been read. `raise_errors`: if False, report damage as `ok=False` instead of
+    raising an error.
     """
 
     def __init__(self, block: int, raise_errors: bool) -> None:

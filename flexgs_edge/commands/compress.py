@@ -14,15 +14,12 @@ from flexgs_edge.goals.promise import in_the_way, kept_promise
 from flexgs_edge.goals.steps import SearchResult
 from flexgs_edge.io.exchange import write_offset
 from flexgs_edge.methods.best import method as best
-from flexgs_edge.methods.best.spill import expected_bytes, prepare_memory
 from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.decoding import read_often
 from flexgs_edge.run.doubts import doubts
-from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.live import live_scenes
@@ -40,60 +37,33 @@ LOG = logging.getLogger("flexgs_edge")
 def compress(
     input: ScenePlace,
     output: str | os.PathLike[str] | None,
-    options: CompressOptions | None = None,
-    progress: Progress = SILENT,
-    given: GivenViews | None = None,
-    **words: Any,
+    options: CompressOptions | None = None,  # what the command line would say
+    progress: Progress = SILENT,  # bars on long work
+    given: GivenViews | None = None,  # cameras and photos from memory
+    **words: Any,  # single options by the names of `CompressOptions`, such as `max_drop=0.5`
 ) -> CompressResult:
     """Compress a scene to the fewest bytes that hold a target.
 
-    Parameters
-    ----------
-    input : path or CheckedScene
-        A scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), INRIA's model folder, or a scene that is open.
-    output : path or None
-        The `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
-    options : CompressOptions, optional
-        What the command line would say.
-    progress : Progress, optional
-        Bars on long work.
-    given : GivenViews, optional
-        Cameras and photos from memory.
-    **words
-        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
-
-    Returns
-    -------
-    CompressResult
-        Sizes, quality of the decoded file, every step of the search, times.
-
-    Raises
-    ------
-    FlexGSError
-        `InputError`, `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
+    `input`: a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`), INRIA's model folder, or a scene that is
+    open. `output`: the `.fgs`, `.spz`, `.sog` or `.compressed.ply` to write (None, for a `.fgs`, only in a dry run).
+    Returns sizes, quality of the decoded file, every step of the search, times. Raises `FlexGSError`: `InputError`,
+    `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
     if options.target_is_default:
         # The scene or the format may be out of the default target's reach. Who named no target wants a file all the same.
         options = replace(options, best_effort=True)
     run = open_compression(input, output, options, progress, given)
-    with run.clock.stage("open"):
-        prepare_memory(run)
-        _foresee(run)
+    method = paper if options.method == "paper" else best if run.output.format is None else foreign
     with ExitStack() as stack:
-        bench = None if run.views is None else stack.enter_context(open_bench(run, options.cluster))
-        _foresee(run, opened=True)
-        if bench is not None:
-            run = check_views(run, bench, options.trust_views)
-        ready = run if bench is None or options.method != "paper" else _read_often(run, bench)
-        if options.method == "paper":
-            made = paper.compress(ready, bench)
-        elif run.output.format is not None:
-            assert bench is not None  # the plan has refused such runs without views
-            made = foreign.compress(ready, bench)
+        bench = None
+        if run.views is None:
+            run.budget.require("the scene", 0)
         else:
-            assert bench is not None  # the plan has refused such runs without views
-            made = best.compress(ready, bench)
+            needed = partial(method.expected_bytes, run)
+            bench = stack.enter_context(open_bench(run, options.cluster, needed))
+            run = check_views(run, bench, options.trust_views)
+        made = method.compress(run, bench)
         result = _result(run, bench, made)
     if run.output.path is not None and run.output.format is not None and run.output.offset is not None:
         LOG.info(write_offset(run.output.path, run.output.offset, run.output.format, options.force))
@@ -103,22 +73,6 @@ def compress(
             _show_live(run, run.output.path)
         run.reporter.write(result, None if run.plan is None else run.plan.target)
     return result
-
-
-def _foresee(run: Run[CompressOptions], opened: bool = False) -> None:
-    """Let the first error about the memory limit name one that is enough; `opened` as for `foresee`."""
-    if run.views is None:
-        run.budget.require("the scene", 0)
-    else:
-        needed = paper.expected_bytes if run.options.method == "paper" else expected_bytes
-        foresee(run, opened, partial(needed, run))
-
-
-def _read_often(run: Run[CompressOptions], bench: Bench) -> Run[CompressOptions]:
-    """The same run for the paper's search, which reads the scene for every choice that it measures."""
-    with run.clock.stage("open"):
-        spare = paper.searching_bytes(run)
-        return run.of_source(read_often(run.source, run.budget, spare, bench.renderer.backend))
 
 
 def _show_live(run: Run[CompressOptions], path: Path) -> None:

@@ -14,7 +14,7 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_folder, check_writable
 from flexgs_edge.io.formats import format_of
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.batch_result import BatchItem, BatchResult
 from flexgs_edge.report.results import CompressResult
@@ -32,48 +32,27 @@ OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "score_cache": (None,),
     "report": (None,),
     "resume": (False,),
-}
-"""Options that belong to one scene, and their values that suit any scene."""
+}  # Options that belong to one scene, and their values that suit any scene
 
 
 def compress_all(
     inputs: Sequence[StrPath] | StrPath,
     output: StrPath | None,
-    options: CompressOptions | None = None,
-    progress: Progress = SILENT,
-    format: str | None = None,
+    options: CompressOptions | None = None,  # What the command line would say. Targets hold for each scene.
+    progress: Progress = SILENT,  # bars on long work
+    format: str | None = None,  # Suffix of the files, such as `.spz`. Default: `.fgs`.
     after: Callable[[BatchResult], object] | None = None,
-    **words: Any,
+    **words: Any,  # single options by the names of `CompressOptions`, such as `max_drop=0.5`
 ) -> BatchResult:
     """Compress several scenes into a folder; a scene that fails does not stop the others.
 
-    Parameters
-    ----------
-    inputs : path or sequence of paths
-        Scene files, model folders, and folders of scenes. A folder that is no scene stands for the scenes directly in it.
-    output : path or None
-        The folder to write to, made if it is missing (None only in a dry run). Each file is named after its scene, with the
-        suffix replaced. Scenes of the same name keep their suffix too, then get the names of their folders in front.
-    options : CompressOptions, optional
-        What the command line would say. Targets hold for each scene.
-    progress : Progress, optional
-        Bars on long work.
-    format : str, optional
-        Suffix of the files, such as `.spz`. Default: `.fgs`.
-    after : callable, optional
-        Called with the result so far after each scene, for those who want it even if the run is interrupted.
-    **words
-        Single options by the names of `CompressOptions`, such as `max_drop=0.5`.
-
-    Returns
-    -------
-    BatchResult
-        The result of each scene, or its error. Errors of single scenes are logged, not raised.
-
-    Raises
-    ------
-    InputError
-        Before any work: if the folder cannot be written to, or an option does not fit several scenes or the format.
+    `inputs`: scene files, model folders, and folders of scenes. A folder that is no scene stands for the scenes
+    directly in it. `output`: the folder to write to, made if it is missing (None only in a dry run). Each file is named
+    after its scene, with the suffix replaced. Scenes of the same name keep their suffix too, then get the names of
+    their folders in front. `after`: called with the result so far after each scene, for those who want it even if the
+    run is interrupted. Returns the result of each scene, or its error. Errors of single scenes are logged, not raised.
+    Raises `InputError`: Before any work: if the folder cannot be written to, or an option does not fit several scenes
+    or the format.
     """
     options = replace(options or CompressOptions(), **words)
     suffix = output_suffix(format)
@@ -98,12 +77,7 @@ def compress_all(
 class _Batch:
     """Scenes, their files, and what has become of them.
 
-    Parameters
-    ----------
-    scenes, files : sequence of str
-        As many.
-    after : callable or None
-        Called after each scene.
+    `scenes`, `files`: as many. `after`: called after each scene.
     """
 
     def __init__(

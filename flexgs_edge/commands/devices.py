@@ -11,18 +11,9 @@ from flexgs_edge.report.file_results import DevicesResult
 def devices(device: str | None = None, self_test: bool = False) -> DevicesResult:
     """List the OpenCL devices, test those that have no verdict yet, and choose the one that other commands would use.
 
-    Parameters
-    ----------
-    device : str, optional
-        Device to choose: a number, part of a name, `cpu` or `gpu`. Default: the first GPU that works, else
-        a processor.
-    self_test : bool, optional
-        Test every device anew. Default: verdicts of earlier tests hold, until kernels or drivers change.
-
-    Returns
-    -------
-    DevicesResult
-        `chosen` is `None` if no device works; this raises no error.
+    `device`: device to choose: a number, part of a name, `cpu` or `gpu`. Default: the first GPU that works, else a
+    processor. `self_test`: test every device anew. Default: verdicts of earlier tests hold, until kernels or drivers
+    change. Returns `chosen` is `None` if no device works; this raises no error.
     """
     found = tuple(list_with_verdicts(self_test))
     try:

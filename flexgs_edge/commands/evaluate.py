@@ -14,7 +14,7 @@ from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -25,43 +25,22 @@ from flexgs_edge.run.view_set import views_info
 
 
 def evaluate(
-    input: str | Path,
+    input: str | Path,  # the scene to measure: a file or a model folder
     against: str | Path,
     options: ViewOptions | None = None,
-    base_psnr: float = DEFAULT_BASE_PSNR,
-    progress: Progress = SILENT,
+    base_psnr: float = DEFAULT_BASE_PSNR,  # assumed PSNR of the original against its photos, for the modelled drop, dB
+    progress: Progress = SILENT,  # shows a bar
     report: str | Path | None = None,
-    force: bool = False,
-    lpips: bool = False,
-    **words: Any,
+    force: bool = False,  # overwrite an earlier report
+    lpips: bool = False,  # also measure LPIPS, which takes far longer (extra `lpips`)
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> EvaluateResult:
     """Measure the quality that a scene lost against its original.
 
-    Parameters
-    ----------
-    input : path
-        The scene to measure: a file or a model folder.
-    against : path
-        The original. Its cameras and photos are used if it has some beside it, else those beside `input`.
-    options : ViewOptions, optional
-        Options as on the command line. Default: measure the held-out views; `holdout=0` measures all.
-    base_psnr : float
-        Assumed PSNR of the original against its photos, for the modelled drop, dB.
-    progress : Progress, optional
-        Shows a bar.
-    report : path, optional
-        Write a page about the run (index.html) and its record (result.json) to this folder.
-    force : bool
-        Overwrite an earlier report.
-    lpips : bool
-        Also measure LPIPS, which takes far longer (extra `lpips`).
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    EvaluateResult
-        Quality of every view, times and memory.
+    `against`: the original. Its cameras and photos are used if it has some beside it, else those beside `input`.
+    `options`: options as on the command line. Default: measure the held-out views; `holdout=0` measures all. `report`:
+    write a page about the run (index.html) and its record (result.json) to this folder. Returns quality of every view,
+    times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if not 0.0 < base_psnr < 200.0:
@@ -75,10 +54,8 @@ def evaluate(
     def needed() -> int:
         return drawing_bytes(run) + decode_bytes(run.source, None) + decode_bytes(scene.source, None)
 
-    foresee(run, search=needed)
     with ExitStack() as stack:
-        bench = stack.enter_context(open_bench(run))
-        foresee(run, opened=True, search=needed)
+        bench = stack.enter_context(open_bench(run, needed=needed))
         run, renderer = check_views(run, bench, trusted=True), bench.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing

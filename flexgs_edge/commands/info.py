@@ -13,16 +13,9 @@ from flexgs_edge.run.open_scene import check_fgs, is_fgs, open_file
 def info(path: str | os.PathLike[str]) -> InfoResult:
     """Read what a scene file holds.
 
-    Parameters
-    ----------
-    path : path
-        A `.fgs`, a `.ply`, a file of another program's format, or a model folder. Of a `.fgs` only the header is read. One
-        that was cut is decoded, which takes longer: only its symbols tell the bytes per channel.
-
-    Returns
-    -------
-    InfoResult
-        Counts, settings, and the bytes of every channel of a `.fgs`.
+    `path`: a `.fgs`, a `.ply`, a file of another program's format, or a model folder. Of a `.fgs` only the header is
+    read. One that was cut is decoded, which takes longer: only its symbols tell the bytes per channel. Returns counts,
+    settings, and the bytes of every channel of a `.fgs`.
     """
     place = Path(path)
     if is_fgs(place):

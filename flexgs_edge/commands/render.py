@@ -18,7 +18,7 @@ from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.judge import LIBRARY_BYTES
 from flexgs_edge.run.open_bench import bench_info, open_bench
@@ -30,42 +30,21 @@ LOG = logging.getLogger("flexgs_edge")
 
 PNG_LEVEL = 2
 """Effort of the PNG's compression: a fourth of the default's time, 8 to 21 % more bytes. docs/results/tuning.md#png_level"""
-PICTURE_BYTES = 48
-"""Bound on the bytes a pixel of a view that is read, rounded and written as PNG."""
+PICTURE_BYTES = 48  # Bound on the bytes a pixel of a view that is read, rounded and written as PNG
 
 
 def render_views(
-    input: str | Path,
-    output: str | Path,
-    options: ViewOptions | None = None,
-    views: Sequence[int] | None = None,
-    force: bool = False,
-    progress: Progress = SILENT,
-    **words: Any,
+    input: str | Path,  # a scene file or a model folder
+    output: str | Path,  # folder for the files; created if it does not exist
+    options: ViewOptions | None = None,  # options as on the command line
+    views: Sequence[int] | None = None,  # Indices of the views to draw, in order of name. Default: all views.
+    force: bool = False,  # Overwrite existing files. Default: raise `InputError`.
+    progress: Progress = SILENT,  # shows a bar
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> RenderResult:
     """Draw views of a scene as PNG files, `<view name>.png`, with 8 bits per channel.
 
-    Parameters
-    ----------
-    input : path
-        A scene file or a model folder.
-    output : path
-        Folder for the files; created if it does not exist.
-    options : ViewOptions, optional
-        Options as on the command line.
-    views : sequence of int, optional
-        Indices of the views to draw, in order of name. Default: all views.
-    force : bool
-        Overwrite existing files. Default: raise `InputError`.
-    progress : Progress, optional
-        Shows a bar.
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    RenderResult
-        Files, and the time of each view.
+    Returns files, and the time of each view.
     """
     options = replace(options or ViewOptions(), **words)
     run = open_run(input, options, progress, photos=False)
@@ -79,9 +58,7 @@ def render_views(
     def needed() -> int:
         return writing + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    foresee(run, search=needed, compares=False)
-    with open_bench(run) as bench:
-        foresee(run, opened=True, search=needed, compares=False)
+    with open_bench(run, needed=needed, compares=False) as bench:
         renderer = bench.renderer
         run.budget.take("writing pictures", writing)
         with clock.stage("load"):

@@ -16,7 +16,7 @@ from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scen
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes, foresee
+from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
@@ -25,38 +25,18 @@ from flexgs_edge.run.view_set import views_info
 
 
 def score_gaussians(
-    input: str | Path,
+    input: str | Path,  # a scene file or a model folder
     output: str | Path,
-    options: ViewOptions | None = None,
-    score: str = "gs",
-    force: bool = False,
-    progress: Progress = SILENT,
-    **words: Any,
+    options: ViewOptions | None = None,  # options as on the command line
+    score: str = "gs",  # The score to compute. Default: `gs`.
+    force: bool = False,  # Overwrite `output` if it exists. Default: raise `InputError`.
+    progress: Progress = SILENT,  # shows a bar
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> ScoreResult:
     """Score every Gaussian over the training views, and save the scores.
 
-    Parameters
-    ----------
-    input : path
-        A scene file or a model folder.
-    output : path
-        The `.npz` file to write, as `score_cache` reads it: `scores` [N] f64, logarithms of the scores, -inf for Gaussians
-        that no view sees, and a fingerprint of what they depend on.
-    options : ViewOptions, optional
-        Options as on the command line.
-    score : {"gs", "meson"}
-        The score to compute. Default: `gs`.
-    force : bool
-        Overwrite `output` if it exists. Default: raise `InputError`.
-    progress : Progress, optional
-        Shows a bar.
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    ScoreResult
-        What was scored, times and memory.
+    `output`: the `.npz` file to write, as `score_cache` reads it: `scores` [N] f64, logarithms of the scores, -inf for
+    Gaussians that no view sees, and a fingerprint of what they depend on. Returns what was scored, times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if score not in SCORES:
@@ -74,9 +54,7 @@ def score_gaussians(
     def needed() -> int:
         return sums + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    foresee(run, search=needed, compares=False)
-    with open_bench(run) as bench:
-        foresee(run, opened=True, search=needed, compares=False)
+    with open_bench(run, needed=needed, compares=False) as bench:
         renderer = bench.renderer
         run.budget.take("scores", sums)
         with clock.stage("load"):

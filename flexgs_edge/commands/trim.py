@@ -20,30 +20,10 @@ def trim(
 ) -> TrimResult:
     """Copy as many whole layers of a `.fgs` file as fit into a size; its preview if none does. Takes as long as copying the file.
 
-    Parameters
-    ----------
-    input : path
-        A `.fgs` of version 2. The original scene and cameras are not needed.
-    output : path
-        The `.fgs` to write.
-    max_size : int
-        Most bytes of the new file.
-    force : bool
-        Overwrite `output` if it exists. Default: raise `InputError`.
-
-    Returns
-    -------
-    TrimResult
-        Layers, Gaussians and bytes kept.
-
-    Raises
-    ------
-    InputError
-        If the file has no layers.
-    FormatError
-        If the file is damaged.
-    TargetError
-        If neither the first layer nor the preview fits.
+    `input`: a `.fgs` of version 2. The original scene and cameras are not needed. `output`: the `.fgs` to write.
+    `max_size`: most bytes of the new file. `force`: overwrite `output` if it exists. Default: raise `InputError`.
+    Returns layers, Gaussians and bytes kept. Raises `InputError` if the file has no layers. Raises `FormatError` if the
+    file is damaged. Raises `TargetError` if neither the first layer nor the preview fits.
     """
     if max_size < 1:
         raise InputError(f"--max-size {max_size}: expected at least 1 byte")

@@ -14,20 +14,8 @@ from flexgs_edge.run.open_scene import check_fgs
 def verify(path: str | os.PathLike[str]) -> VerifyResult:
     """Check every checksum of a `.fgs` file. A damaged part is reported, not raised.
 
-    Parameters
-    ----------
-    path : path
-        The `.fgs` file.
-
-    Returns
-    -------
-    VerifyResult
-        Whether each part is whole.
-
-    Raises
-    ------
-    FormatError
-        If the header is damaged: the parts behind it cannot be found then.
+    `path`: the `.fgs` file. Returns whether each part is whole. Raises `FormatError` if the header is damaged: the
+    parts behind it cannot be found then.
     """
     place = Path(path)
     if os.path.isdir(place) or (os.path.exists(place) and place.suffix.lower() != ".fgs"):

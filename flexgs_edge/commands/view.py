@@ -46,42 +46,20 @@ _SCENE = "viewer/scene.fgs"
 def view(
     input: str | os.PathLike[str],
     output: str | os.PathLike[str] | None = None,
-    options: ViewOptions | None = None,
-    force: bool = False,
-    progress: Progress = SILENT,
+    options: ViewOptions | None = None,  # options as on the command line: cameras, and how the scene is drawn
+    force: bool = False,  # Overwrite `output`. Default: raise `InputError`.
+    progress: Progress = SILENT,  # shows bars
     host: str = "127.0.0.1",
     port: int = 0,
-    browser: bool = True,
-    ready: Callable[[SceneServer], None] | None = None,
-    **words: Any,
+    browser: bool = True,  # open the page in the browser
+    ready: Callable[[SceneServer], None] | None = None,  # called with the server before it serves
+    **words: Any,  # single options, by the names of `ViewOptions`
 ) -> ViewResult:
     """Look at a scene in the browser.
 
-    Parameters
-    ----------
-    input : path
-        A scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value.
-    output : path, optional
-        Write a page of one file, which opens from disk without a network. Default: serve until interrupted.
-    options : ViewOptions, optional
-        Options as on the command line: cameras, and how the scene is drawn.
-    force : bool
-        Overwrite `output`. Default: raise `InputError`.
-    progress : Progress, optional
-        Shows bars.
-    host, port : str, int
-        Where to serve. Default: this machine alone, any free port.
-    browser : bool
-        Open the page in the browser.
-    ready : callable, optional
-        Called with the server before it serves.
-    **words
-        Single options, by the names of `ViewOptions`.
-
-    Returns
-    -------
-    ViewResult
-        What was shown, and where.
+    `input`: a scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value. `output`:
+    write a page of one file, which opens from disk without a network. Default: serve until interrupted. `host`, `port`:
+    where to serve. Default: this machine alone, any free port. Returns what was shown, and where.
     """
     if output is not None:
         if Path(output).suffix.lower() not in (".html", ".htm"):

@@ -20,27 +20,17 @@ WORST_TIMES, WORST_MORE = 1.5, 0.2
 SSIM_PER_DB = 0.015
 """SSIM that may be lost for each dB of the target. The paper's method loses 0.010 to 0.019 at 1 dB:
 docs/results/tuning.md#ssim_per_db"""
-LEAST_SSIM = 1e-4
-"""Least SSIM that a target allows to lose; rounding alone loses a part of it."""
-LOST_ALONE = 1.5
-"""A view that loses so many times the share of all other bounds needs more than finer steps."""
+LEAST_SSIM = 1e-4  # Least SSIM that a target allows to lose; rounding alone loses a part of it
+LOST_ALONE = 1.5  # A view that loses so many times the share of all other bounds needs more than finer steps
 MADE_GAP = 3.0
 """Generated poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
 
 
 class Part(ABC):
-    """One bound of the promise.
+    """One bound of the promise."""
 
-    Attributes
-    ----------
-    name : str
-        What it is about, in two words.
-    option : str
-        The option that moves or lifts it.
-    """
-
-    name: str
-    option: str
+    name: str  # what it is about, in two words
+    option: str  # the option that moves or lifts it
 
     @abstractmethod
     def found(self, measurement: Measurement) -> float | None:
@@ -141,17 +131,10 @@ class Promised:
     """A target, and the parts of the promise that hold with it.
 
     With a size target the size alone says whether a point holds; of those that fit, one that keeps the promise is better.
-
-    Parameters
-    ----------
-    target : Target
-        What the user asked for.
-    parts : tuple of Part
-        The other bounds.
     """
 
-    target: Target
-    parts: tuple[Part, ...]
+    target: Target  # what the user asked for
+    parts: tuple[Part, ...]  # the other bounds
 
     @property
     def figure(self) -> Figure:
@@ -265,45 +248,24 @@ def promised(target: Target, parts: Sequence[Part]) -> Target:
 class KeptPart:
     """How a part of the promise stands at a measured point.
 
-    Parameters
-    ----------
-    name : str
-        `worst view`, `SSIM lost` or `made poses`.
-    words : str
-        The figure and its bound in words.
-    found, allowed : float or None
-        The figure, `None` if it was not measured, and its bound.
-    share : float or None
-        The figure over its bound.
-    held : bool
-        Whether the bound holds; True for a figure that was not measured.
+    `found`, `allowed`: the figure, `None` if it was not measured, and its bound.
     """
 
-    name: str
-    words: str
+    name: str  # `worst view`, `SSIM lost` or `made poses`
+    words: str  # the figure and its bound in words
     found: float | None
     allowed: float
-    share: float | None
-    held: bool
+    share: float | None  # the figure over its bound
+    held: bool  # whether the bound holds; True for a figure that was not measured
 
 
 @dataclass(frozen=True)
 class KeptPromise:
-    """How the promise stands at a measured point.
+    """How the promise stands at a measured point."""
 
-    Parameters
-    ----------
-    parts : tuple of KeptPart
-        In the order of the promise.
-    decided : str
-        Name of the part of which the largest share is used, or `target`.
-    share : float
-        The largest share of all, the target's included.
-    """
-
-    parts: tuple[KeptPart, ...]
-    decided: str
-    share: float
+    parts: tuple[KeptPart, ...]  # in the order of the promise
+    decided: str  # name of the part of which the largest share is used, or `target`
+    share: float  # the largest share of all, the target's included
 
     @property
     def held(self) -> bool:

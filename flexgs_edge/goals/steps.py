@@ -5,46 +5,63 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.goals.promise import Promised, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
+
+@dataclass(frozen=True, order=True)
+class Choice:
+    """How much to prune, in thousandths of the N rows."""
+
+    prune: int  # share of the rows that is removed (the paper's p)
+    sh: int  # share of the rows that loses its SH above degree 0 (the paper's s)
+
+    def __post_init__(self) -> None:
+        if self.prune < 0 or self.sh < 0 or self.prune + self.sh > 1000:
+            raise InputError(
+                f"prune rate {self.prune / 1000} and SH rate {self.sh / 1000}: "
+                "expected rates from 0 to 1 that add up to at most 1"
+            )
+
+    @classmethod
+    def from_rates(cls, prune: float, sh: float) -> Choice:
+        """A choice from shares between 0 and 1, rounded to thousandths.
+
+        >>> Choice.from_rates(0.4, 0.3)
+        Choice(prune=400, sh=300)
+        """
+        if not (0 <= prune <= 1 and 0 <= sh <= 1):
+            raise InputError(
+                f"prune rate {prune} and SH rate {sh}: expected rates from 0 to 1 that add up to at most 1"
+            )
+        return cls(round(prune * 1000), round(sh * 1000))
+
+    def pruned(self, count: int) -> int:
+        """Number of rows removed from a scene of `count` rows."""
+        return count * self.prune // 1000
+
+    def boundary(self, count: int) -> int:
+        """Rank below which a row has lost its SH, or is removed."""
+        return count * (self.prune + self.sh) // 1000
+
+
 Phase = Literal["list", "refine", "confirm", "fixed", "multiplier"]
-MAX_PRUNE = 980
-"""Largest prune rate of the refinement, in thousandths; something must be left to draw."""
-REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}
-"""Measured points of the refinement for each `--effort`."""
+MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
+REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}  # Measured points of the refinement for each `--effort`
 
 
 @dataclass(frozen=True)
 class Step:
-    """One point of a search.
+    """One point of a search."""
 
-    Parameters
-    ----------
-    choice : Choice
-        Prune rate and SH rate, in thousandths.
-    size : int
-        Exact bytes of the file.
-    measurement : Measurement or None
-        Quality; `None` if size alone decided.
-    excess : float
-        By how much the point misses the target; zero or less holds.
-    phase : {"list", "refine", "confirm", "fixed", "multiplier"}
-        Part of the search that asked for the point.
-    seconds : float
-        Wall time of the measurement.
-    estimated : bool
-        `measurement` comes from a part of the pixels, and `excess` is an estimate for all of them.
-    """
-
-    choice: Choice
-    size: int
-    measurement: Measurement | None
-    excess: float
-    phase: Phase
-    seconds: float
+    choice: Choice  # prune rate and SH rate, in thousandths
+    size: int  # exact bytes of the file
+    measurement: Measurement | None  # quality; `None` if size alone decided
+    excess: float  # by how much the point misses the target; zero or less holds
+    phase: Phase  # part of the search that asked for the point
+    seconds: float  # wall time of the measurement
+    # `measurement` comes from a part of the pixels, and `excess` is an estimate for all of them.
     estimated: bool = False
 
     @property
@@ -55,43 +72,21 @@ class Step:
 
 @dataclass(frozen=True)
 class Scored:
-    """The camera poses that a search by measured costs has scored.
+    """The camera poses that a search by measured costs has scored."""
 
-    Parameters
-    ----------
-    poses : int
-        Scored poses.
-    made : int
-        Generated poses among them (`--views-margin`).
-    unseen : int
-        Gaussians that could show, but that no scored pose sees.
-    """
-
-    poses: int
-    made: int
-    unseen: int
+    poses: int  # scored poses
+    made: int  # generated poses among them (`--views-margin`)
+    unseen: int  # Gaussians that could show, but that no scored pose sees
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The answer of a search, and the points on the way to it.
+    """The answer of a search, and the points on the way to it."""
 
-    Parameters
-    ----------
-    chosen : Step
-        The point to write.
-    reached : bool
-        The target holds at `chosen`; only `--best-effort` accepts a point that misses.
-    steps : tuple of Step
-        All points, in order.
-    scored : Scored or None
-        The poses behind the scores; `None` for searches that are given scores.
-    """
-
-    chosen: Step
-    reached: bool
-    steps: tuple[Step, ...]
-    scored: Scored | None = None
+    chosen: Step  # the point to write
+    reached: bool  # the target holds at `chosen`; only `--best-effort` accepts a point that misses
+    steps: tuple[Step, ...]  # all points, in order
+    scored: Scored | None = None  # the poses behind the scores; `None` for searches that are given scores
 
 
 class Point(Protocol):

@@ -16,61 +16,34 @@ from flexgs_edge.units import format_size
 Figure = Literal["drop", "modelled drop", "fidelity"]
 """The figure that decides: drop against photos, modelled drop, or fidelity (PSNR against the original's renders)."""
 
-IDENTICAL_DB = 200.0
-"""Fidelity of identical renders in comparisons; it is never reported."""
+IDENTICAL_DB = 200.0  # Fidelity of identical renders in comparisons; it is never reported
 
 
 @dataclass(frozen=True)
 class Covered:
-    """Fidelity and modelled drop over the part of the pictures that the original covers, in dB.
+    """Fidelity and modelled drop over the part of the pictures that the original covers, in dB."""
 
-    Parameters
-    ----------
-    fidelity : float or None
-        PSNR against the original's renders; `None` if they are identical.
-    modelled_drop : float
-        Drop modelled from that error.
-    """
-
-    fidelity: float | None
-    modelled_drop: float
+    fidelity: float | None  # PSNR against the original's renders; `None` if they are identical
+    modelled_drop: float  # drop modelled from that error
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Quality of one point of a search, means over the views that decide, in dB.
+    """Quality of one point of a search, means over the views that decide, in dB."""
 
-    Parameters
-    ----------
-    drop : float or None
-        Drop against the photos, where a view that gains counts as 0, and one that its photo cannot judge by its modelled
-        drop; `None` without photos.
-    fidelity : float or None
-        PSNR against the original's renders; `None` if they are identical.
-    modelled_drop : float
-        Drop modelled from the error against the original's renders.
-    worst : Measurement or None
-        Quality of the worst view alone.
-    covered : Covered or None
-        The same figures over covered pixels, which decide in place of the plain ones; `None` if the plain ones decide.
-    usual : float or None
-        Mean over the views of the drop that decides, where a view that gains counts as 0; `None` if not known.
-    ssim_drop : float or None
-        SSIM lost, against photos or modelled; `None` if not measured.
-    made_gap : float or None
-        How much less fidelity made poses have, dB; `None` if not measured.
-    losses : tuple of float or None
-        Drop of each view that decides, dB, in their order; `None` for views with hardly any coverage.
-    """
-
+    # Drop against the photos, where a view that gains counts as 0, and one that its photo cannot judge by its modelled
+    # drop; `None` without photos.
     drop: float | None
-    fidelity: float | None
-    modelled_drop: float
-    worst: Measurement | None = None
+    fidelity: float | None  # PSNR against the original's renders; `None` if they are identical
+    modelled_drop: float  # drop modelled from the error against the original's renders
+    worst: Measurement | None = None  # quality of the worst view alone
+    # The same figures over covered pixels, which decide in place of the plain ones; `None` if the plain ones decide.
     covered: Covered | None = None
+    # Mean over the views of the drop that decides, where a view that gains counts as 0; `None` if not known.
     usual: float | None = None
-    ssim_drop: float | None = None
-    made_gap: float | None = None
+    ssim_drop: float | None = None  # SSIM lost, against photos or modelled; `None` if not measured
+    made_gap: float | None = None  # how much less fidelity made poses have, dB; `None` if not measured
+    # Drop of each view that decides, dB, in their order; `None` for views with hardly any coverage.
     losses: tuple[float | None, ...] = ()
 
     def figure(self, figure: Figure) -> float | None:

@@ -12,48 +12,21 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 @dataclass(frozen=True, eq=False)
 class GridScene:
-    """A scene in integer codes. Rows are sorted by layer, then along the Morton curve of their position cells.
+    """A scene in integer codes. Rows are sorted by layer, then along the Morton curve of their position cells."""
 
-    Parameters
-    ----------
-    count : int
-        Rows n.
-    sh_degree : int
-        D; 0 if no row has SH.
-    origin : np.ndarray
-        [3] f64, world: positions are relative to it.
-    step_sizes : StepSizes
-        A value is its code times the step size.
-    position : np.ndarray
-        [3, n] i32.
-    scale : np.ndarray
-        [3, n] i32.
-    rotation : np.ndarray
-        [3, n] i32: x, y, z of the unit quaternion, which has w >= 0 and no component larger than w.
-    opacity : np.ndarray
-        [n] i32.
-    dc : np.ndarray
-        [3, n] i32: Y, Co, Cg.
-    sh_degrees : np.ndarray
-        [n] u8, 0 to D.
-    sh : tuple of np.ndarray
-        For each degree l from 1 to D: [3 * (2l + 1), rows with a degree >= l] i32: all Y, all Co, all Cg.
-    layer : np.ndarray
-        [n] u8, ascending; all 0 if there are no layers.
-    """
-
-    count: int
-    sh_degree: int
-    origin: np.ndarray
-    step_sizes: StepSizes
-    position: np.ndarray
-    scale: np.ndarray
-    rotation: np.ndarray
-    opacity: np.ndarray
-    dc: np.ndarray
-    sh_degrees: np.ndarray
+    count: int  # rows n
+    sh_degree: int  # D; 0 if no row has SH
+    origin: np.ndarray  # [3] f64, world: positions are relative to it
+    step_sizes: StepSizes  # a value is its code times the step size
+    position: np.ndarray  # [3, n] i32
+    scale: np.ndarray  # [3, n] i32
+    rotation: np.ndarray  # [3, n] i32: x, y, z of the unit quaternion, which has w >= 0 and no component larger than w
+    opacity: np.ndarray  # [n] i32
+    dc: np.ndarray  # [3, n] i32: Y, Co, Cg
+    sh_degrees: np.ndarray  # [n] u8, 0 to D
+    # For each degree l from 1 to D: [3 * (2l + 1), rows with a degree >= l] i32: all Y, all Co, all Cg.
     sh: tuple[np.ndarray, ...]
-    layer: np.ndarray
+    layer: np.ndarray  # [n] u8, ascending; all 0 if there are no layers
 
     @property
     def sh_count(self) -> int:

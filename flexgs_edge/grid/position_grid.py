@@ -9,8 +9,7 @@ from flexgs_edge.grid.step_sizes import POSITION_BITS
 from flexgs_edge.memory.rows import COPY_ROWS, blocks, read_rows
 from flexgs_edge.scene.contraction import OCTAVES, Contraction, densest
 
-_HALF = 2 ** (POSITION_BITS - 1) - 2
-"""Steps from the centre of a grid to its ends."""
+_HALF = 2 ** (POSITION_BITS - 1) - 2  # Steps from the centre of a grid to its ends
 _LEAST_RADIUS = _HALF.bit_length() - OCTAVES.bit_length()
 """Binary logarithm of the smallest radius, in steps: all octaves then fit."""
 
@@ -21,12 +20,7 @@ def position_grid(means: np.ndarray, step: float) -> tuple[float, Contraction | 
     Where the grid is too small for the scene, positions beyond a radius are contracted. The radius is the largest for which all
     fit, so that as many positions as possible stay as they are.
 
-    Parameters
-    ----------
-    means : np.ndarray
-        [3, n] f32, finite.
-    step : float
-        Step size as wanted.
+    `means`: [3, n] f32, finite. `step`: step size as wanted.
     """
     ranges = np.array(plane_ranges(means), np.float64)
     if not len(ranges) or np.ptp(ranges, axis=1).max() <= (2**POSITION_BITS - 2) * step:

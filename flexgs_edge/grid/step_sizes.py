@@ -12,44 +12,23 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.contraction import Contraction
 
-POSITION_BITS = 21
-"""A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits."""
+POSITION_BITS = 21  # A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits
 
 Planes = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Step sizes of a grid; each is rounded to float32 once.
+    """Step sizes of a grid; each is rounded to float32 once."""
 
-    Parameters
-    ----------
-    position : float
-        In scene units.
-    scale : float
-        Of the natural logarithm of a scale.
-    rotation : float
-        Of x, y and z of a unit quaternion.
-    opacity : float
-        Of the logit.
-    dc : float
-        Of the luma of the SH coefficient of degree 0.
-    sh : tuple of float
-        Of the luma of SH coefficients, one for each degree from 1.
-    chroma : float, optional
-        Factor by which the steps of the two chroma planes are larger.
-    contraction : Contraction, optional
-        Of the positions that the grid holds. Default: they are not contracted.
-    """
-
-    position: float
-    scale: float
-    rotation: float
-    opacity: float
-    dc: float
-    sh: tuple[float, ...] = ()
-    chroma: float = 1.5
-    contraction: Contraction | None = None
+    position: float  # in scene units
+    scale: float  # of the natural logarithm of a scale
+    rotation: float  # of x, y and z of a unit quaternion
+    opacity: float  # of the logit
+    dc: float  # of the luma of the SH coefficient of degree 0
+    sh: tuple[float, ...] = ()  # of the luma of SH coefficients, one for each degree from 1
+    chroma: float = 1.5  # factor by which the steps of the two chroma planes are larger
+    contraction: Contraction | None = None  # Of the positions that the grid holds. Default: they are not contracted.
 
     def __post_init__(self) -> None:
         for name, value in self._numbers().items():

@@ -20,45 +20,20 @@ from flexgs_edge.scene.rotations import canonical_axes
 
 
 def to_grid(
-    planes: Planes,
-    sh_degrees: np.ndarray,
-    steps: StepSizes,
-    origin: np.ndarray | Sequence[float],
-    layer: np.ndarray | None = None,
-    storage: Storage = IN_MEMORY,
-    rename: bool = True,
+    planes: Planes,  # {field: [width, n] f32}, finite; `means` relative to `origin`
+    sh_degrees: np.ndarray,  # [n], the SH degree to keep for each row; higher coefficients are left out
+    steps: StepSizes,  # needs one SH step for each degree kept
+    origin: np.ndarray | Sequence[float],  # [3] f64
+    layer: np.ndarray | None = None,  # [n], 0 to 255
+    storage: Storage = IN_MEMORY,  # holds the grid
 ) -> tuple[GridScene, np.ndarray]:
     """Put a scene on a grid.
 
-    A Gaussian has 24 equal forms, since its axes can be permuted and reversed. By default we write the form with the
+    A Gaussian has 24 equal forms, since its axes can be permuted and reversed. We write the form with the
     smallest rotation, which needs the fewest bits.
 
-    Parameters
-    ----------
-    planes : mapping
-        {field: [width, n] f32}, finite; `means` relative to `origin`.
-    sh_degrees : np.ndarray
-        [n], the SH degree to keep for each row; higher coefficients are left out.
-    steps : StepSizes
-        Needs one SH step for each degree kept.
-    origin : array_like
-        [3] f64.
-    layer : np.ndarray, optional
-        [n], 0 to 255.
-    storage : Storage, optional
-        Holds the grid.
-    rename : bool
-        Take the form with the smallest rotation; False keeps rotations and scales as they are.
-
-    Returns
-    -------
-    tuple
-        The `GridScene`, and [n] i64: the input row of each of its rows.
-
-    Raises
-    ------
-    InputError
-        If a value is not finite, or its code is out of range; nothing is clipped.
+    Returns the `GridScene`, and [n] i64: the input row of each of its rows. Raises `InputError` if a value is not
+    finite, or its code is out of range; nothing is clipped.
     """
     count = planes["means"].shape[1]
     degrees = _bytes("sh_degrees", sh_degrees, count, MAX_SH_DEGREE)
@@ -71,8 +46,7 @@ def to_grid(
     ordered = OrderedPlanes(planes, order, storage)
     for part, values in ordered.parts(count, "quats", "log_scales", "opacity_logits", "sh_dc"):
         rows, (quats, log_scales, logits, colours) = order[part], values
-        if rename:
-            quats, log_scales = canonical_axes(quats, log_scales)
+        quats, log_scales = canonical_axes(quats, log_scales)
         put_rows(scale, part, _codes("log_scales", log_scales, steps.scale, rows))
         put_rows(rotation, part, _codes("quats", quats[1:], steps.rotation, rows))
         put_rows(opacity, part, _codes("opacity_logits", logits, steps.opacity, rows)[0])
@@ -124,6 +98,30 @@ def _along_curve(
     layers = None if layer is None else _bytes("layer", layer, count, 255)
     order = stable_order(keys, storage) if layers is None else np.lexsort((keys, layers)).astype(np.int64)
     return storage.take(codes, order), order
+
+
+def lowered(grid: GridScene, storage: Storage = IN_MEMORY) -> GridScene:
+    """Lower the SH degree of each row as far as its codes are zero; the values stay the same, and zeros are not stored."""
+    degrees, bands = grid.sh_degrees.copy(), list(grid.sh)
+    for degree in range(grid.sh_degree, 0, -1):
+        codes = grid.sh[degree - 1]
+        rows = np.flatnonzero(grid.sh_degrees >= degree)
+        zero = np.empty(len(rows), bool)
+        for part in blocks(len(rows)):
+            zero[part] = ~read_rows(codes, part).any(axis=0)
+        # A row with a higher degree also needs this one.
+        zero &= degrees[rows] == degree
+        degrees[rows[zero]] = degree - 1
+        if zero.any():
+            bands[degree - 1] = storage.take(codes, np.flatnonzero(~zero))
+    top = int(degrees.max(initial=0))
+    return replace(
+        grid,
+        sh_degree=top,
+        step_sizes=replace(grid.step_sizes, sh=grid.step_sizes.sh[:top]),
+        sh_degrees=degrees,
+        sh=tuple(bands[:top]),
+    )
 
 
 def recolour(

@@ -54,10 +54,7 @@ def from_grid(
     w = sqrt(max(0, 1 - ((x*x + y*y) + z*z))). Colours take h = Cg * 0.5, c = Co * 0.5, t = Y - h, and then
     red = t + c, green = Y + h, blue = t - c. Positions are then expanded, if they are contracted (`Contraction`).
 
-    Returns
-    -------
-    dict
-        {field: [width, n] f32}; SH above a row's degree are zero.
+    Returns {field: [width, n] f32}; SH above a row's degree are zero.
     """
     steps = grid.step_sizes
     makers = {

@@ -63,11 +63,7 @@ class CompressedPlySource(DecodedSource):
     """
 
     def __init__(
-        self,
-        name: str,
-        ranges: dict[str, tuple[np.ndarray, np.ndarray]],
-        words: dict[str, np.ndarray],
-        sh: np.ndarray,
+        self, name: str, ranges: dict[str, tuple[np.ndarray, np.ndarray]], words: dict[str, np.ndarray], sh: np.ndarray
     ) -> None:
         held = sum(a.nbytes + b.nbytes for a, b in ranges.values()) + sum(w.nbytes for w in words.values()) + sh.nbytes
         super().__init__(name, len(sh), REST_WIDTHS[sh.shape[1]], held)

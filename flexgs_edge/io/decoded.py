@@ -11,33 +11,17 @@ from flexgs_edge.io.frames import Frame
 from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
-_BLOCK_ROWS = 16384
-"""Rows decoded at a time, so that intermediate arrays stay small."""
+_BLOCK_ROWS = 16384  # Rows decoded at a time, so that intermediate arrays stay small
 
 
 class DecodedSource(SceneSource):
     """A scene whose packed values lie in memory, in the file's own frame.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    count : int
-        Gaussians.
-    sh_degree : int
-        0 to 4.
-    held_bytes : int
-        Bytes that the packed values take in memory.
-
-    Attributes
-    ----------
-    frame : Frame or None
-        The frame that the file itself states; `None`: that of its format.
-    settings : mapping
-        How the file says that it is drawn, such as `{"antialiased": True}`.
+    `name`: the user's path, for messages. `count`: Gaussians. `sh_degree`: 0 to 4. `held_bytes`: bytes that the packed
+    values take in memory. `settings`: how the file says that it is drawn, such as `{"antialiased": True}`.
     """
 
-    frame: Frame | None = None
+    frame: Frame | None = None  # the frame that the file itself states; `None`: that of its format
 
     def __init__(self, name: str, count: int, sh_degree: int, held_bytes: int = 0) -> None:
         self.name, self.count, self.sh_degree = name, count, sh_degree

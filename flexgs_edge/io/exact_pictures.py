@@ -9,10 +9,8 @@ import numpy as np
 
 from flexgs_edge.errors import FormatError
 
-_WEBP_PLACE = 20
-"""First byte of the first chunk of a WebP."""
-_LARGEST_CHUNKS = 64
-"""Chunks of a WebP that are looked through."""
+_WEBP_PLACE = 20  # First byte of the first chunk of a WebP
+_LARGEST_CHUNKS = 64  # Chunks of a WebP that are looked through
 _DAMAGED = (OSError, SyntaxError, struct.error, ValueError, EOFError, RuntimeError, IndexError, KeyError)
 """What Pillow raises for pictures that it cannot decode."""
 
@@ -20,10 +18,7 @@ _DAMAGED = (OSError, SyntaxError, struct.error, ValueError, EOFError, RuntimeErr
 def picture_size(data: bytes, place: str) -> tuple[int, int]:
     """Width and height that a picture claims, without decoding it.
 
-    Raises
-    ------
-    FormatError
-        If it is neither a still WebP nor a PNG of 8-bit channels.
+    Raises `FormatError` if it is neither a still WebP nor a PNG of 8-bit channels.
     """
     try:
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
@@ -41,10 +36,7 @@ def picture_size(data: bytes, place: str) -> tuple[int, int]:
 def read_pixels(data: bytes, place: str) -> np.ndarray:
     """Decode a picture whose size was checked: [H, W, 4] u8, red green blue alpha, as they are stored.
 
-    Raises
-    ------
-    FormatError
-        If it cannot be decoded.
+    Raises `FormatError` if it cannot be decoded.
     """
     from PIL.PngImagePlugin import PngImageFile
     from PIL.WebPImagePlugin import WebPImageFile

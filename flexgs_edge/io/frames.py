@@ -23,21 +23,14 @@ _ODD_AXES = (
     *("xy", "yz", "", "xz", ""),
     *("y", "xyz", "y", "z", "x", "z", "x"),
     *("xy", "yz", "xy", "yz", "", "xz", "", "xz", ""),
-)
-"""The axes in which each SH function above degree 0 is odd, in the order of INRIA's coefficients, for degrees 1 to 4."""
+)  # The axes in which each SH function above degree 0 is odd, in the order of INRIA's coefficients, for degrees 1 to 4
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Directions of the axes, relative to RDF.
+    """Directions of the axes, relative to RDF."""
 
-    Parameters
-    ----------
-    name : str
-        Three letters, such as `RUB`.
-    """
-
-    name: str
+    name: str  # three letters, such as `RUB`
 
     def __post_init__(self) -> None:
         letters = tuple(zip(_POSITIVE, _NEGATIVE, strict=True))
@@ -64,12 +57,9 @@ class Frame:
         return np.array(signs, np.float32)
 
 
-RDF = Frame("RDF")
-"""x right, y down, z forward: INRIA's and COLMAP's frame, and the one inside this program."""
-RUB = Frame("RUB")
-"""x right, y up, z back: the frame of OpenGL, three.js and `.spz`."""
-LUF = Frame("LUF")
-"""x left, y up, z forward: the frame of glTF."""
+RDF = Frame("RDF")  # x right, y down, z forward: INRIA's and COLMAP's frame, and the one inside this program
+RUB = Frame("RUB")  # x right, y up, z back: the frame of OpenGL, three.js and `.spz`
+LUF = Frame("LUF")  # x left, y up, z forward: the frame of glTF
 
 
 class FrameSource(SceneSource):

@@ -17,10 +17,7 @@ def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[Sc
 
     Positions, scales, rotations and opacities are the same as with SH.
 
-    Returns
-    -------
-    tuple
-        A source of SH degree 0, and [N] i64: the row of `source` behind each row.
+    Returns a source of SH degree 0, and [N] i64: the row of `source` behind each row.
     """
     path = folder / f"geometry{format.suffix}"
     write_foreign(path, _WithoutSh(source), force=True)

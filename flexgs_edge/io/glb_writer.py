@@ -24,8 +24,7 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import Planes, SceneSource
 
 _CHUNK_ROWS = 32768
-_LARGEST = 2**32 - 1
-"""Most bytes of a `.glb`: its header has 32 bits for them."""
+_LARGEST = 2**32 - 1  # Most bytes of a `.glb`: its header has 32 bits for them
 _UNSIGNED_BYTE, _SHORT, _FLOAT = 5121, 5122, 5126
 _POINTS, _VERTICES = 0, 34962
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
@@ -58,10 +57,7 @@ class _Attribute:
 def write_glb(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     """Write a scene. See `io.formats.Format.writer` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If the file would have more than 4 GiB, the most that a `.glb` can have.
+    Raises `InputError` if the file would have more than 4 GiB, the most that a `.glb` can have.
     """
     attributes = _attributes(source.sh_degree)
     header = _header(source, attributes)

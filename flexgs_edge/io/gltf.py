@@ -41,8 +41,7 @@ SPZ_EXTENSIONS = (
     "KHR_gaussian_splatting_compression_spz_2",
     "KHR_gaussian_splatting_compression_spz",
     "KHR_spz_gaussian_splats_compression",
-)
-"""Names of the extension that keeps a `.spz`; the last one is that of 2025, on the primitive itself."""
+)  # Names of the extension that keeps a `.spz`; the last one is that of 2025, on the primitive itself
 _KNOWN = (EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization")
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
 """Beginnings of extensions that do not concern splats."""
@@ -52,21 +51,15 @@ _DEGREES = 3
 _NEGATIVE_SHARE = 0.01
 _ROWS_PER_BYTE = 16
 """Most Gaussians that a byte of the file may stand for: nodes can show one mesh many times, but not without end."""
-_MOST_PARTS = 1 << 12
-"""Most times that splats are shown: each read goes over all of them."""
-_SHOWN = 16
-"""Most notes of a scene, and extensions in a message."""
+_MOST_PARTS = 1 << 12  # Most times that splats are shown: each read goes over all of them
+_SHOWN = 16  # Most notes of a scene, and extensions in a message
 
 
 def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
     """Open a `.glb` or `.gltf`. See `io.formats.Format.reader` for the arguments.
 
-    Raises
-    ------
-    InputError
-        If it shows no Gaussians, or needs an extension that we do not know.
-    FormatError
-        If it is damaged.
+    Raises `InputError` if it shows no Gaussians, or needs an extension that we do not know. Raises `FormatError` if it
+    is damaged.
     """
     file = GltfFile(path, name)
     unknown = [word for word in file.json.texts("extensionsRequired") if not _is_known(word)]

@@ -31,18 +31,10 @@ _BLOCK_BYTES = 1 << 22
 
 @dataclass(frozen=True)
 class Packed:
-    """Numbers of an accessor as they are stored.
+    """Numbers of an accessor as they are stored."""
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [n, width] of the stored type.
-    normalized : bool
-        Whole numbers stand for -1 to 1, or for 0 to 1 if they have no sign.
-    """
-
-    values: np.ndarray
-    normalized: bool
+    values: np.ndarray  # [n, width] of the stored type
+    normalized: bool  # whole numbers stand for -1 to 1, or for 0 to 1 if they have no sign
 
     def read(self, rows: Rows) -> np.ndarray:
         """[width, n] f64, some rows."""
@@ -72,26 +64,9 @@ class _Buffer:
 class GltfFile:
     """An open glTF file.
 
-    Parameters
-    ----------
-    path : Path
-        What is opened.
-    name : str
-        The user's path, for messages; files beside it are looked for there.
-
-    Attributes
-    ----------
-    json : Record
-        The whole JSON.
-    size : int
-        Bytes of the file, and of the buffers beside it that were used.
-    notes : list of str
-        What was left out.
-
-    Raises
-    ------
-    FormatError
-        If the file is damaged, or is no glTF 2.0.
+    `path`: what is opened. `name`: the user's path, for messages; files beside it are looked for there. `json`: the
+    whole JSON. `size`: bytes of the file, and of the buffers beside it that were used. `notes`: what was left out.
+    Raises `FormatError` if the file is damaged, or is no glTF 2.0.
     """
 
     def __init__(self, path: Path, name: str) -> None:

@@ -14,10 +14,7 @@ from flexgs_edge.errors import FormatError, brief
 def load_record(text: bytes, name: str) -> Record:
     """The object that a JSON text holds.
 
-    Raises
-    ------
-    FormatError
-        If the text is not JSON, or holds no object.
+    Raises `FormatError` if the text is not JSON, or holds no object.
     """
     try:
         return Record(name, "the JSON", json.loads(text))
@@ -32,14 +29,8 @@ def load_record(text: bytes, name: str) -> Record:
 class Record:
     """One object of the JSON; every method raises `FormatError`.
 
-    Parameters
-    ----------
-    name : str
-        The file, for messages.
-    place : str
-        The object, for messages, such as `accessors[3]`.
-    value : Any
-        Must be an object.
+    `name`: the file, for messages. `place`: the object, for messages, such as `accessors[3]`. `value`: must be an
+    object.
     """
 
     def __init__(self, name: str, place: str, value: Any) -> None:

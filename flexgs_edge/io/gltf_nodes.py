@@ -19,44 +19,27 @@ from flexgs_edge.scene.rotations import matrices, quats_of, times
 from flexgs_edge.scene.turn_sh import band_matrices, turn_sh
 from flexgs_edge.small_matrices import product
 
-_SAME = 1e-6
-"""Largest difference between the scales of axes that count as one: the rounding of float32."""
-_STILL = 1e-12
-"""Largest difference from the identity that is rounding alone."""
+_SAME = 1e-6  # Largest difference between the scales of axes that count as one: the rounding of float32
+_STILL = 1e-12  # Largest difference from the identity that is rounding alone
 
-_MOVES = {"matrix", "rotation", "scale", "translation"}
-"""Keys of a node that move it."""
+_MOVES = {"matrix", "rotation", "scale", "translation"}  # Keys of a node that move it
 
-Reader = Callable[[str], np.ndarray]
-"""Gives the values of a field before they are moved, [width, n] f64."""
+Reader = Callable[[str], np.ndarray]  # Gives the values of a field before they are moved, [width, n] f64
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A mesh that a node shows.
+    """A mesh that a node shows."""
 
-    Parameters
-    ----------
-    mesh : int
-        Index of the mesh.
-    node : int
-        Index of the node.
-    matrix : np.ndarray
-        [4, 4] f64, from the mesh to the world.
-    """
-
-    mesh: int
-    node: int
-    matrix: np.ndarray
+    mesh: int  # index of the mesh
+    node: int  # index of the node
+    matrix: np.ndarray  # [4, 4] f64, from the mesh to the world
 
 
 def shown_meshes(file: Record) -> Iterator[Shown]:
     """All meshes that the default scene shows: the named one, else the first; without scenes, all nodes.
 
-    Raises
-    ------
-    FormatError
-        If nodes do not form trees, or a transform is not finite.
+    Raises `FormatError` if nodes do not form trees, or a transform is not finite.
     """
     seen: set[int] = set()
     waiting = [(index, np.eye(4), asker) for index, asker in reversed(_roots(file))]
@@ -106,10 +89,7 @@ def _local_matrix(node: Record) -> np.ndarray:
 class Move:
     """What a matrix makes of Gaussians.
 
-    Parameters
-    ----------
-    matrix : np.ndarray
-        [4, 4] f64.
+    `matrix`: [4, 4] f64.
     """
 
     def __init__(self, matrix: np.ndarray) -> None:

@@ -40,10 +40,8 @@ class AttributeSplats:
     opacities: Packed
     dc: Packed
     rest: list[Packed]
-    has_colours: bool
-    """`dc` holds colours, not SH."""
-    as_logs: bool = False
-    """`scales` holds logarithms."""
+    has_colours: bool  # `dc` holds colours, not SH
+    as_logs: bool = False  # `scales` holds logarithms
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
         """See `Splats`."""
@@ -78,14 +76,8 @@ class SpzSplats:
 class GltfSource(DecodedSource):
     """The splats of a glTF, one after the other.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    parts : sequence of (Splats, Move)
-        Gaussians, and where they are shown.
-    held_bytes : int
-        Bytes of their packed values.
+    `name`: the user's path, for messages. `parts`: Gaussians, and where they are shown. `held_bytes`: bytes of their
+    packed values.
     """
 
     def __init__(self, name: str, parts: Sequence[tuple[Splats, Move]], held_bytes: int) -> None:

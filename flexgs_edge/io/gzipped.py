@@ -17,12 +17,9 @@ from flexgs_edge.scene.source import SceneSource
 
 GZ = ".gz"
 _BLOCK = 1 << 20
-LEAST_FREE = 1 << 28
-"""Bytes of the temporary disk that stay free."""
-MOST_TIMES = 200
-"""Scenes unpack to 1.1 to 10 times their size, and any gzip file to at most 1032 times."""
-SMALL = 1 << 26
-"""Unpacked bytes that need no such bound."""
+LEAST_FREE = 1 << 28  # Bytes of the temporary disk that stay free
+MOST_TIMES = 200  # Scenes unpack to 1.1 to 10 times their size, and any gzip file to at most 1032 times
+SMALL = 1 << 26  # Unpacked bytes that need no such bound
 
 
 def unpacked(
@@ -30,25 +27,10 @@ def unpacked(
 ) -> SceneSource:
     """Unpack a file into the folder that TMPDIR names, and open it there.
 
-    Parameters
-    ----------
-    path : Path
-        The packed file.
-    name : str
-        The user's path, for messages.
-    open_file : callable
-        Opens the unpacked file.
-    least_free : int, optional
-        Bytes of the temporary disk that must stay free.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it is no whole gzip file, or unpacks to far more than a scene would.
-    BudgetError
-        If the temporary disk has no room for it.
+    `path`: the packed file. `name`: the user's path, for messages. `open_file`: opens the unpacked file. `least_free`:
+    bytes of the temporary disk that must stay free. Raises `InputError` if the file cannot be read. Raises
+    `FormatError` if it is no whole gzip file, or unpacks to far more than a scene would. Raises `BudgetError` if the
+    temporary disk has no room for it.
     """
     check_readable(path, name)
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")

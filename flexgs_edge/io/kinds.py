@@ -15,10 +15,8 @@ from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.ply_layout import PlyHeader, read_header
 
 GZIP_MAGIC = b"\x1f\x8b"
-_HEAD = 1 << 16
-"""Bytes that are looked at."""
-_PEEK = 64
-"""Bytes that are unpacked of a gzip file, to see what it holds."""
+_HEAD = 1 << 16  # Bytes that are looked at
+_PEEK = 64  # Bytes that are unpacked of a gzip file, to see what it holds
 _LFS = b"version https://git-lfs.github.com/spec/"
 _FGS = b"\x93FGS\r\n\x1a\n"
 _IMAGES = {
@@ -37,23 +35,13 @@ _PHOTO = f"photos go to --images; {_TRAIN}"
 
 @dataclass(frozen=True)
 class Kind:
-    """What a file is.
+    """What a file is."""
 
-    Parameters
-    ----------
-    words : str
-        With its article: `a PNG image`.
-    advice : str
-        What to do next, where this program cannot read it.
-    suffix : str or None
-        Suffix of the format of scenes that it follows; `None` if it holds no scene that we know.
-    hosts : tuple of str
-        Suffixes of formats that are built on this one: their readers say more about what is wrong.
-    """
-
-    words: str
-    advice: str = ""
+    words: str  # with its article: `a PNG image`
+    advice: str = ""  # what to do next, where this program cannot read it
+    # Suffix of the format of scenes that it follows; `None` if it holds no scene that we know.
     suffix: str | None = None
+    # Suffixes of formats that are built on this one: their readers say more about what is wrong.
     hosts: tuple[str, ...] = ()
 
     def refused(self, name: str) -> FormatError:
@@ -73,10 +61,7 @@ def kind_of(path: Path, name: str) -> Kind | None:
 
     Formats without a first mark (`.splat`, `.ksplat`) are never told.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
+    Raises `InputError` if the file cannot be read.
     """
     try:
         with open(path, "rb") as file:

@@ -23,10 +23,8 @@ from flexgs_edge.scene.source import Rows, by_chunk
 
 _HEADER_BYTES, _SECTION_BYTES, _CENTRE_BYTES = 4096, 1024, 12
 _MAX_DEGREE = 3
-_SH_RANGE = 1.5
-"""SH of level 2 reach so far on both sides, unless the header says otherwise."""
-_POSITION_RANGE = 32767
-"""Code of a bucket's centre, unless the section says otherwise."""
+_SH_RANGE = 1.5  # SH of level 2 reach so far on both sides, unless the header says otherwise
+_POSITION_RANGE = 32767  # Code of a bucket's centre, unless the section says otherwise
 
 
 @dataclass(frozen=True)
@@ -64,30 +62,14 @@ _LEVELS = (_Level("<f4", "<f4", "<f4"), _Level("<u2", "<f2", "<f2"), _Level("<u2
 
 @dataclass(frozen=True)
 class _Section:
-    """Gaussians with the same layout.
+    """Gaussians with the same layout."""
 
-    Parameters
-    ----------
-    table : np.ndarray
-        [n, bytes of a row] u8.
-    sh_degree : int
-        0 to 3.
-    ends : np.ndarray
-        [buckets] i64, the row behind each bucket that has Gaussians.
-    centres : np.ndarray
-        [buckets, 3] f32.
-    step : float
-        Unit of the positions, scene units.
-    middle : int
-        Code of a bucket's centre.
-    """
-
-    table: np.ndarray
-    sh_degree: int
-    ends: np.ndarray
-    centres: np.ndarray
-    step: float
-    middle: int
+    table: np.ndarray  # [n, bytes of a row] u8
+    sh_degree: int  # 0 to 3
+    ends: np.ndarray  # [buckets] i64, the row behind each bucket that has Gaussians
+    centres: np.ndarray  # [buckets, 3] f32
+    step: float  # unit of the positions, scene units
+    middle: int  # code of a bucket's centre
 
 
 class KsplatSource(DecodedSource):
@@ -146,10 +128,7 @@ def _sh_places(section_degree: int, degree: int) -> np.ndarray:
 def read_ksplat(path: Path, name: str, reading: Reading) -> KsplatSource:
     """Open a `.ksplat`; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If the file breaks the format.
+    Raises `FormatError` if the file breaks the format.
     """
     data = np.fromfile(path, np.uint8)
     if len(data) < _HEADER_BYTES:

@@ -12,12 +12,10 @@ from typing import Any
 from flexgs_edge.errors import FormatError, InputError
 
 _ITERATION = re.compile(r"iteration_([0-9]{1,18})")
-_CFG_LIMIT = 1 << 16
-"""Most bytes of cfg_args, which normally has a few hundred."""
+_CFG_LIMIT = 1 << 16  # Most bytes of cfg_args, which normally has a few hundred
 
 
-POINT_CLOUD = "point_cloud.ply"
-"""What INRIA's program calls the scene of an iteration."""
+POINT_CLOUD = "point_cloud.ply"  # What INRIA's program calls the scene of an iteration
 
 
 def latest_iteration(folder: Path) -> Path:
@@ -55,10 +53,7 @@ def find_companions(path: str | os.PathLike[str]) -> Companions:
     photos in another place. It may also tell that the model is antialiased; the reference program leaves `antialiasing`
     out.
 
-    Raises
-    ------
-    FormatError
-        If `cfg_args` cannot be understood.
+    Raises `FormatError` if `cfg_args` cannot be understood.
     """
     place = Path(path)
     folder = place if place.is_dir() else place.parent

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from flexgs_edge.errors import FormatError, brief
 
-Pieces = Callable[[str], bytes]
-"""Gives the bytes of a piece by its name; raises `FormatError` if it is not there."""
+Pieces = Callable[[str], bytes]  # Gives the bytes of a piece by its name; raises `FormatError` if it is not there
 
 _MOST_UNPACKED = 1 << 22
 _MOST_GAIN = 8
@@ -21,17 +20,13 @@ a second compression."""
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError),
     *(OSError, OverflowError, IndexError, KeyError),
-)
-"""What zipfile raises for files that it cannot read."""
+)  # What zipfile raises for files that it cannot read
 
 
 def piece_place(folder: Path, piece: str, name: str) -> Path:
     """The file of a piece below a folder.
 
-    Raises
-    ------
-    FormatError
-        If the name leads out of the folder, also by a link.
+    Raises `FormatError` if the name leads out of the folder, also by a link.
     """
     inside = f"{name}: {brief(piece)}: expected the name of a file in its folder or below it"
     if not piece or "\\" in piece or ":" in piece or os.path.isabs(piece) or ".." in piece.split("/"):
@@ -97,10 +92,7 @@ def zip_pieces(archive: zipfile.ZipFile, name: str, first: str) -> Pieces:
 def open_zip(path: Path, name: str) -> zipfile.ZipFile:
     """Open a zip; `name` is what messages call it.
 
-    Raises
-    ------
-    FormatError
-        If it is none.
+    Raises `FormatError` if it is none.
     """
     path.stat()  # the file can be read, or this error says why not
     try:

@@ -29,12 +29,9 @@ from flexgs_edge.io.ply_layout import (
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
-BLOCK_ROWS = 4096
-"""Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache."""
-_BLOCK_BYTES = 1 << 22
-"""Most bytes of these rows: a file may have any number of properties."""
-_SPAN = 4
-"""A list of rows is read as one span of the file if the span has at most this many rows for each wanted one."""
+BLOCK_ROWS = 4096  # Rows read at a time: 1 MB at SH degree 3, so that gathering stays in the processor's cache
+_BLOCK_BYTES = 1 << 22  # Most bytes of these rows: a file may have any number of properties
+_SPAN = 4  # A list of rows is read as one span of the file if the span has at most this many rows for each wanted one
 _GAP = 64
 """Rows between two wanted ones are read too, up to this many: a read of its own for the second would take as long."""
 _ORIGIN_ROWS = 65536
@@ -52,22 +49,10 @@ class PlySource(SceneSource):
     positions are rounded to float32. Mip-Splatting's `filter_3D` is applied to scales and opacities. `settings` name
     the model as antialiased if it has one, or as a comment of Brush or Postshot says.
 
-    Parameters
-    ----------
-    path : path
-        The file; it must not change while the source is in use (checked at every read).
-    block_rows : int, optional
-        Rows that are read at a time.
-    name : str, optional
-        The path for messages. Default: `path`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If it breaks the format or is not a Gaussian scene; the message names the header line, the property or the
-        bytes.
+    `path`: the file; it must not change while the source is in use (checked at every read). `block_rows`: rows that are
+    read at a time. `name`: the path for messages. Default: `path`. Raises `InputError` if the file cannot be read.
+    Raises `FormatError` if it breaks the format or is not a Gaussian scene; the message names the header line, the
+    property or the bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str], block_rows: int = BLOCK_ROWS, name: str | None = None) -> None:
@@ -158,15 +143,7 @@ def choose_origin(positions: np.ndarray) -> np.ndarray:
     extent, rounded up to a power of two (1 if there is none). The origin is the grid point nearest to the centre. It is
     0 if the centre is within 16 grid steps of zero on every axis: such scenes lose too little to be moved.
 
-    Parameters
-    ----------
-    positions : np.ndarray
-        [n, 3] f64, world.
-
-    Returns
-    -------
-    np.ndarray
-        [3] f64, world.
+    `positions`: [n, 3] f64, world. Returns [3] f64, world.
 
     >>> choose_origin(np.array([[500000.0, 0.0, 1.0], [500003.0, 1.0, 1.5]]))
     array([500000.,      0.,      0.])
@@ -327,28 +304,10 @@ def write_ply(
     Properties are `float`. Positions are world positions. They are `double` only where the origin is not zero and
     float32 does not hold them exactly. The source's `comments` are written to the header.
 
-    Parameters
-    ----------
-    path : path
-        Gets its name only when the file is complete.
-    source : SceneSource
-        May be the very file that is overwritten.
-    force : bool, optional
-        Replace an existing file.
-    chunk_rows : int, optional
-        Rows held in memory at a time.
-
-    Returns
-    -------
-    tuple of str
-        Notes for the summary.
-
-    Raises
-    ------
-    InputError
-        If the file exists and `force` is not set, or the folder is missing.
-    BudgetError
-        If the disk is full.
+    `path`: gets its name only when the file is complete. `source`: may be the very file that is overwritten. `force`:
+    replace an existing file. `chunk_rows`: rows held in memory at a time. Returns notes for the summary. Raises
+    `InputError` if the file exists and `force` is not set, or the folder is missing. Raises `BudgetError` if the disk
+    is full.
     """
     # What lies on a grid of ours (`valid`) is not decoded a second time to find out.
     wide = bool(np.any(source.origin != 0)) and (source.valid or not _floats_hold(source, chunk_rows))

@@ -35,14 +35,11 @@ _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
 _MOST_LINES = 1 << 13
 """Most bytes and lines of a header; those of scenes have 2 kB in a hundred lines. What comes later is not looked at."""
-_SILENT = ("nx", "ny", "nz")
-"""Properties of INRIA's layout without content (normals)."""
+_SILENT = ("nx", "ny", "nz")  # Properties of INRIA's layout without content (normals)
 RGB = ("red", "green", "blue")
 """8-bit colours, which nerfstudio's export has in place of `f_dc` with `--ply-color-mode rgb`."""
-_SHOWN = 8
-"""Most names in a message."""
-PROGRAM = "flexgs-edge"
-"""First word of our comments."""
+_SHOWN = 8  # Most names in a message
+PROGRAM = "flexgs-edge"  # First word of our comments
 SMOOTHING = "filter_3D"
 """Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not
 include."""
@@ -83,30 +80,14 @@ class Element:
 
 @dataclass
 class PlyHeader:
-    """A parsed header.
+    """A parsed header."""
 
-    Attributes
-    ----------
-    name : str
-        The user's path, for messages.
-    order : str
-        Byte order, "<" or ">"; "" for ascii.
-    elements : list of Element
-        In the order of the file.
-    data_offset : int
-        First byte of the data.
-    comments : tuple of str
-        Comments that this program wrote.
-    antialiased : bool or None
-        What a comment of Brush or Postshot says; `None` without one.
-    """
-
-    name: str
-    order: str
-    elements: list[Element]
-    data_offset: int
-    comments: tuple[str, ...] = ()
-    antialiased: bool | None = None
+    name: str  # the user's path, for messages
+    order: str  # byte order, "<" or ">"; "" for ascii
+    elements: list[Element]  # in the order of the file
+    data_offset: int  # first byte of the data
+    comments: tuple[str, ...] = ()  # comments that this program wrote
+    antialiased: bool | None = None  # what a comment of Brush or Postshot says; `None` without one
 
     @property
     def vertex(self) -> Element:
@@ -152,15 +133,8 @@ class PlyHeader:
     def check_size(self, size: int) -> int:
         """Compare the claims of the header with the file's `size` in bytes (exactly for binary files without lists).
 
-        Returns
-        -------
-        int
-            Bytes behind the data; 0 where lists or text leave them unknown.
-
-        Raises
-        ------
-        FormatError
-            If data are missing.
+        Returns bytes behind the data; 0 where lists or text leave them unknown. Raises `FormatError` if data are
+        missing.
         """
         for element in self.elements:
             if element.count and not element.properties:
@@ -184,10 +158,7 @@ class PlyHeader:
 def read_header(name: str, file: BinaryIO) -> PlyHeader:
     """Parse the header of the PLY `file`, which must be at its start; messages call it `name`.
 
-    Raises
-    ------
-    FormatError
-        If the header breaks the format; the message names the line and what was expected there.
+    Raises `FormatError` if the header breaks the format; the message names the line and what was expected there.
     """
     number, order, elements, comments, antialiased = 0, None, list[Element](), list[str](), None
     names: set[tuple[str, ...]] = set()
@@ -280,10 +251,7 @@ def _add(names: set[tuple[str, ...]], name: tuple[str, ...], twice: str) -> None
 def gaussian_layout(header: PlyHeader) -> tuple[int, tuple[str, ...]]:
     """SH degree of the scene, and notes on properties that are left out.
 
-    Raises
-    ------
-    FormatError
-        If properties are missing or of the wrong type, or the number of `f_rest_*` is wrong.
+    Raises `FormatError` if properties are missing or of the wrong type, or the number of `f_rest_*` is wrong.
     """
     vertex = header.vertex
     by_name = {p.name: p for p in vertex.properties}

@@ -11,21 +11,13 @@ from flexgs_edge.io.frames import Frame
 
 @dataclass(frozen=True)
 class Reading:
-    """How to read a scene file.
+    """How to read a scene file."""
 
-    Parameters
-    ----------
-    frame : Frame or None
-        The frame of the file's axes, if it breaks the rule of its format. Default: as the file says, else as its format has it.
-    lod : int or None
-        Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
-    sh_degree : int or None
-        Leave out SH above this degree. Default: keep all.
-    """
-
+    # The frame of the file's axes, if it breaks the rule of its format. Default: as the file says, else as its format
+    # has it.
     frame: Frame | None = None
-    lod: int | None = None
-    sh_degree: int | None = None
+    lod: int | None = None  # Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
+    sh_degree: int | None = None  # Leave out SH above this degree. Default: keep all.
 
     @classmethod
     def of(cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None) -> Reading:
@@ -41,21 +33,11 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """How to write another program's format.
+    """How to write another program's format."""
 
-    Parameters
-    ----------
-    spz_version : {3, 4}
-        Version of a `.spz`. Older programs read only 3.
-    antialiased : bool
-        The model is antialiased; formats that can say so, do.
-    force_lossy : bool
-        Write a scene also where the format moves most Gaussians by more than their own size, and a scene far from zero
-        also where the error is more than a tenth of the smallest splat.
-    """
-
-    spz_version: int = 3
-    antialiased: bool = False
+    spz_version: int = 3  # Version of a `.spz`. Older programs read only 3.
+    antialiased: bool = False  # the model is antialiased; formats that can say so, do
+    # Write a scene also where the format cannot hold its positions: see `check_positions`.
     force_lossy: bool = False
 
     def __post_init__(self) -> None:

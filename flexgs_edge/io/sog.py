@@ -10,19 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import FormatError
+from flexgs_edge.io.codes import unpack_small
 from flexgs_edge.io.decoded import DecodedSource
 from flexgs_edge.io.exact_pictures import is_lossy, picture_size, read_pixels
 from flexgs_edge.io.pieces import Pieces, folder_pieces, open_zip, zip_pieces
-from flexgs_edge.io.quat_codes import unpack_small
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.io.sog_meta import BANDS, SogMeta, parse_meta
 from flexgs_edge.scene.source import Rows
 
 META = "meta.json"
-PALETTE_COLUMNS = 64
-"""Entries of the SH palette in a row of its picture."""
-QUAT_MODE = 252
-"""Alpha of a quaternion whose largest component is w; the next ones are x, y and z."""
+PALETTE_COLUMNS = 64  # Entries of the SH palette in a row of its picture
+QUAT_MODE = 252  # Alpha of a quaternion whose largest component is w; the next ones are x, y and z
 _SPARE_ROWS = 1 << 20
 _ROWS_A_BYTE = 16
 """A file may hold the first number of rows, and the second for each of its bytes. Real ones need 10 to 20 bytes a row."""
@@ -55,19 +53,9 @@ def read_sog_folder(path: Path, name: str, reading: Reading) -> SogSource:
 def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
     """Open a scene whose pieces are given.
 
-    Parameters
-    ----------
-    pieces : callable
-        Gives the bytes of `meta.json` and of pictures.
-    meta_name : str
-        Name of the piece that names the others.
-    name : str
-        What messages call the scene.
-
-    Raises
-    ------
-    FormatError
-        If a piece is missing or damaged, or does not fit the others.
+    `pieces`: gives the bytes of `meta.json` and of pictures. `meta_name`: name of the piece that names the others.
+    `name`: what messages call the scene. Raises `FormatError` if a piece is missing or damaged, or does not fit the
+    others.
     """
     meta = parse_meta(pieces(meta_name), f"{name}: {META}")
     data = {key: pieces(piece) for key, piece in meta.files.items()}
@@ -82,14 +70,8 @@ def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
 class SogSource(DecodedSource):
     """A SOG scene, with the bytes of its pictures in memory.
 
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    meta : SogMeta
-        Its checked description.
-    data : dict
-        The coded pictures, by the keys of `SogMeta.files`.
+    `name`: what messages call it. `meta`: its checked description. `data`: the coded pictures, by the keys of
+    `SogMeta.files`.
     """
 
     def __init__(self, name: str, meta: SogMeta, data: dict[str, bytes]) -> None:

@@ -12,64 +12,33 @@ import numpy as np
 from flexgs_edge.errors import FormatError, brief
 from flexgs_edge.io.decoded import opacity_logits
 
-LEVELS = 256
-"""Values of a byte."""
-BANDS: dict[int, int] = {1: 3, 2: 8, 3: 15}
-"""SH coefficients above degree 0 of one colour channel, by SH degree."""
+LEVELS = 256  # Values of a byte
+BANDS: dict[int, int] = {1: 3, 2: 8, 3: 15}  # SH coefficients above degree 0 of one colour channel, by SH degree
 _MOST_COUNT = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class SogMeta:
-    """What `meta.json` says, with the values of bytes as tables: both versions then decode alike.
+    """What `meta.json` says, with the values of bytes as tables: both versions then decode alike."""
 
-    Parameters
-    ----------
-    version : int
-        1 or 2.
-    count : int
-        Gaussians.
-    antialiased : bool
-        Whether the model is drawn antialiased.
-    bounds : np.ndarray
-        [2, 3] f64, lowest and highest positions in the log map.
-    scales : np.ndarray
-        [3, 256] f64, log-scales of the bytes.
-    sh0 : np.ndarray
-        [4, 256] f64, SH coefficients of degree 0 of the bytes, and opacity logits.
-    sh : np.ndarray or None
-        [256] f64, SH coefficients above degree 0 of the bytes; `None` if the scene has none.
-    sh_degree : int or None
-        As the file states it. `None`: it follows from the width of the palette's picture.
-    palette : int or None
-        Entries of the palette. `None`: as many as its picture holds.
-    files : dict
-        Names of the pictures: `means_l`, `means_u`, `quats`, `scales`, `sh0`, `centroids`, `labels`.
-    """
-
-    version: int
-    count: int
-    antialiased: bool
-    bounds: np.ndarray
-    scales: np.ndarray
-    sh0: np.ndarray
-    sh: np.ndarray | None
-    sh_degree: int | None
-    palette: int | None
+    version: int  # 1 or 2
+    count: int  # Gaussians
+    antialiased: bool  # whether the model is drawn antialiased
+    bounds: np.ndarray  # [2, 3] f64, lowest and highest positions in the log map
+    scales: np.ndarray  # [3, 256] f64, log-scales of the bytes
+    sh0: np.ndarray  # [4, 256] f64, SH coefficients of degree 0 of the bytes, and opacity logits
+    sh: np.ndarray | None  # [256] f64, SH coefficients above degree 0 of the bytes; `None` if the scene has none
+    sh_degree: int | None  # As the file states it. `None`: it follows from the width of the palette's picture.
+    palette: int | None  # Entries of the palette. `None`: as many as its picture holds.
+    # Names of the pictures: `means_l`, `means_u`, `quats`, `scales`, `sh0`, `centroids`, `labels`.
     files: dict[str, str]
 
 
 class JsonObject:
     """An object of a JSON file, with its place for messages; every method raises `FormatError`.
 
-    Parameters
-    ----------
-    place : str
-        Such as `scene.sog: meta.json`.
-    value : Any
-        Must be an object.
-    path : str, optional
-        Keys that lead to it, with a dot at the end.
+    `place`: such as `scene.sog: meta.json`. `value`: must be an object. `path`: keys that lead to it, with a dot at the
+    end.
     """
 
     def __init__(self, place: str, value: Any, path: str = "") -> None:
@@ -131,10 +100,7 @@ class JsonObject:
 def parse_object(data: bytes, place: str) -> JsonObject:
     """The object that a JSON text holds.
 
-    Raises
-    ------
-    FormatError
-        If it is no JSON, or another value.
+    Raises `FormatError` if it is no JSON, or another value.
     """
     try:
         return JsonObject(place, json.loads(data))
@@ -153,10 +119,7 @@ def parse_object(data: bytes, place: str) -> JsonObject:
 def parse_meta(data: bytes, place: str) -> SogMeta:
     """Check a `meta.json`.
 
-    Raises
-    ------
-    FormatError
-        If a field is missing or wrong, or the version is unknown.
+    Raises `FormatError` if a field is missing or wrong, or the version is unknown.
     """
     top = parse_object(data, place)
     version = top.integer("version", 1, 2) if top.has("version") else 1

@@ -13,25 +13,21 @@ import numpy as np
 
 from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.codebook import best_codebook, nearest_codes
+from flexgs_edge.io.codes import rounded_quats
 from flexgs_edge.io.exact_pictures import write_pixels
-from flexgs_edge.io.quat_codes import rounded_quats
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.io.sh_palette import sh_palette
+from flexgs_edge.io.sh_palette import best_codebook, nearest_codes, sh_palette
 from flexgs_edge.io.sog import META, PALETTE_COLUMNS, QUAT_MODE
 from flexgs_edge.scene.source import SceneSource
 
-_LARGEST_SIDE = 16380
-"""Pixels of a WebP's side, a multiple of 4."""
-_SMALL = 1024
-"""Scenes of at most so many Gaussians keep all their SH."""
+_LARGEST_SIDE = 16380  # Pixels of a WebP's side, a multiple of 4
+_SMALL = 1024  # Scenes of at most so many Gaussians keep all their SH
 _LARGEST_PALETTE = 65536
 _ROUNDING = 1 / 2048
 _ROUNDING_SHARE = 1 / 32
 """Entries of the SH palette are rounded by the first number (root mean square, an eighth of a level of a display), or so
 that the second share is added to the squared error of the palette, if that is more."""
-_EVEN_CODES = 112
-"""Most even steps of SH on each side of zero; 31 codes are left for values beyond."""
+_EVEN_CODES = 112  # Most even steps of SH on each side of zero; 31 codes are left for values beyond
 _CHUNK_ROWS = 65536
 _DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -39,10 +35,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 def write_sog(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     """Write a `.sog`; see `write_foreign`.
 
-    Raises
-    ------
-    InputError
-        If the scene has more Gaussians than a picture has pixels.
+    Raises `InputError` if the scene has more Gaussians than a picture has pixels.
     """
     if source.count > _LARGEST_SIDE**2:
         raise InputError(

@@ -25,20 +25,14 @@ _PARTS = {
     "sh_dc": slice(24, 27),
     "opacity_logits": slice(27, 28),
     "quats": slice(28, 32),
-}
-"""Bytes of each field in a row."""
+}  # Bytes of each field in a row
 _CHUNK_ROWS = 1 << 16
 
 
 class SplatSource(DecodedSource):
     """A `.splat`: its rows, decoded when they are read.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    table : np.ndarray
-        [N, 32] u8, the rows of the file.
+    `name`: the user's path, for messages. `table`: [N, 32] u8, the rows of the file.
     """
 
     def __init__(self, name: str, table: np.ndarray) -> None:
@@ -69,10 +63,7 @@ def logs(sizes: np.ndarray) -> np.ndarray:
 def read_splat(path: Path, name: str, reading: Reading) -> SplatSource:
     """Open a `.splat`; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If the size is not a multiple of 32 bytes, or there is none.
+    Raises `FormatError` if the size is not a multiple of 32 bytes, or there is none.
     """
     data = np.fromfile(path, np.uint8)
     if not len(data) or len(data) % ROW_BYTES:

@@ -36,12 +36,9 @@ from flexgs_edge.io.spz_layout import (
 )
 from flexgs_edge.scene.source import Rows
 
-_BLOCK = 1 << 18
-"""Packed bytes read at a time."""
-_PIECE = 1 << 20
-"""Unpacked bytes asked for at a time."""
-_TAIL = 1 << 20
-"""Most bytes behind the arrays; extensions have a few."""
+_BLOCK = 1 << 18  # Packed bytes read at a time
+_PIECE = 1 << 20  # Unpacked bytes asked for at a time
+_TAIL = 1 << 20  # Most bytes behind the arrays; extensions have a few
 _MOST_PACKED = 1032
 """Bytes that one byte can unpack to: what deflate reaches. Version 4 has the same limit, as in the reference program."""
 
@@ -49,18 +46,8 @@ _MOST_PACKED = 1032
 class SpzSource(DecodedSource):
     """A `.spz`: its codes, decoded when they are read.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    header : SpzHeader
-        What the file says.
-    arrays : list of np.ndarray
-        [bytes] u8 each, unpacked, in the order of `header.widths`.
-    frame : Frame or None
-        The frame that the file states.
-    notes : tuple of str
-        On what was left out.
+    `name`: the user's path, for messages. `header`: what the file says. `arrays`: [bytes] u8 each, unpacked, in the
+    order of `header.widths`. `frame`: the frame that the file states. `notes`: on what was left out.
     """
 
     def __init__(
@@ -97,10 +84,7 @@ class SpzSource(DecodedSource):
 def read_spz(path: Path, name: str, reading: Reading) -> SpzSource:
     """Open a `.spz`; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If the file breaks the format or unpacks to more than its header says.
+    Raises `FormatError` if the file breaks the format or unpacks to more than its header says.
     """
     with open(path, "rb") as file:
         return parse_spz(file, name, reading)

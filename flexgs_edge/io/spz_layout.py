@@ -17,27 +17,18 @@ from flexgs_edge.scene.fields import sh_rest_count
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, bits behind the point, flags; then a zero, or in version 4 the number of arrays."""
-PLAIN_HEADER = struct.Struct("<4sIIBBBBI12x")
-"""Header of version 4: also the place of the table of sizes."""
-SIZES = struct.Struct("<QQ")
-"""Entry of the table: packed and unpacked bytes of an array."""
-ANTIALIASED, EXTENDED = 1, 2
-"""Flags."""
+PLAIN_HEADER = struct.Struct("<4sIIBBBBI12x")  # Header of version 4: also the place of the table of sizes
+SIZES = struct.Struct("<QQ")  # Entry of the table: packed and unpacked bytes of an array
+ANTIALIASED, EXTENDED = 1, 2  # Flags
 VERSIONS = range(1, 5)
-FIRST_PLAIN = 4
-"""First version with a plain header."""
-POSITION_LIMIT = (1 << 23) - 1
-"""Largest code of a coordinate: 24 bits with a sign."""
-MAX_FRACTION_BITS = 30
-"""Readers compute 1 << bits in 32 bits with a sign."""
-COLOUR_SCALE = 0.15
-"""Colour codes are 0.5 + 0.15 times the coefficient, so that they reach beyond black and white."""
-SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0
-"""Codes of log-scales: 16 a unit, from -10 on."""
+FIRST_PLAIN = 4  # First version with a plain header
+POSITION_LIMIT = (1 << 23) - 1  # Largest code of a coordinate: 24 bits with a sign
+MAX_FRACTION_BITS = 30  # Readers compute 1 << bits in 32 bits with a sign
+COLOUR_SCALE = 0.15  # Colour codes are 0.5 + 0.15 times the coefficient, so that they reach beyond black and white
+SCALE_OFFSET, SCALE_STEPS = 10.0, 16.0  # Codes of log-scales: 16 a unit, from -10 on
 ROTATION_MASK = (1 << 9) - 1
 """Magnitude of a quaternion's component from version 3 on: 9 bits for up to the root of 1/2."""
-_COORDINATES = 0xADBE0003
-"""Type of the extension that states the frame."""
+_COORDINATES = 0xADBE0003  # Type of the extension that states the frame
 _FRAMES = tuple(a + b + c for b, c in ("DB", "UB", "DF", "UF", "FD", "FU", "BD", "BU") for a in "LR")
 """Frames by their number in that extension, from 1 on; 0 says nothing. From 9 on, y and z are exchanged."""
 _SHOWN = 4
@@ -45,27 +36,13 @@ _SHOWN = 4
 
 @dataclass(frozen=True)
 class SpzHeader:
-    """A checked header.
+    """A checked header."""
 
-    Parameters
-    ----------
-    version : int
-        1 to 4.
-    count : int
-        Gaussians.
-    sh_degree : int
-        0 to 4.
-    fraction_bits : int
-        Bits behind the point of coordinates; version 1 has none.
-    flags : int
-        Bits; see `ANTIALIASED` and `EXTENDED`.
-    """
-
-    version: int
-    count: int
-    sh_degree: int
-    fraction_bits: int
-    flags: int = 0
+    version: int  # 1 to 4
+    count: int  # Gaussians
+    sh_degree: int  # 0 to 4
+    fraction_bits: int  # bits behind the point of coordinates; version 1 has none
+    flags: int = 0  # bits; see `ANTIALIASED` and `EXTENDED`
 
     @property
     def widths(self) -> dict[str, int]:
@@ -94,10 +71,7 @@ class SpzHeader:
 def parse_header(name: str, head: bytes) -> SpzHeader:
     """Check the first 16 bytes of an unpacked stream, or of version 4.
 
-    Raises
-    ------
-    FormatError
-        If a field is not as the format has it.
+    Raises `FormatError` if a field is not as the format has it.
     """
     if len(head) < HEADER.size:
         raise FormatError(f"{name}: truncated: expected a header of {HEADER.size} bytes, found {len(head)}")
@@ -114,17 +88,8 @@ def parse_header(name: str, head: bytes) -> SpzHeader:
 def parse_extensions(name: str, block: bytes, asked: Frame | None) -> tuple[Frame | None, tuple[str, ...]]:
     """Find the frame that extensions state, and notes on those that are left out.
 
-    Parameters
-    ----------
-    block : bytes
-        Records of type (u32), length (u32) and content.
-    asked : Frame or None
-        The user's frame: what the file says of it then does not matter.
-
-    Raises
-    ------
-    FormatError
-        If the stated frame is unknown or not one of ours.
+    `block`: records of type (u32), length (u32) and content. `asked`: the user's frame: what the file says of it then
+    does not matter. Raises `FormatError` if the stated frame is unknown or not one of ours.
     """
     frame, others, at = None, dict[str, None](), 0
     while at + 8 <= len(block):

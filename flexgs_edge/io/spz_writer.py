@@ -31,13 +31,10 @@ from flexgs_edge.scene.source import SceneSource
 SH_STEP = 8
 """Step of the SH codes, in units of 1/128; the reference program takes 16 above degree 1, which causes nearly all of its
 loss. A smaller step costs more bytes than it is worth: docs/results/tuning.md#sh_step"""
-_LEAST_BITS = 12
-"""Bits behind the point that other writers always take."""
+_LEAST_BITS = 12  # Bits behind the point that other writers always take
 _BITS_BELOW_SIZE = 5
-_CHUNK_ROWS = 1 << 14
-"""Fixed, since zstd's output may depend on the pieces that it gets."""
-_ZSTD_LEVEL = 19
-"""7 % smaller than the reference program's 12, in the time that gzip takes for version 3."""
+_CHUNK_ROWS = 1 << 14  # Fixed, since zstd's output may depend on the pieces that it gets
+_ZSTD_LEVEL = 19  # 7 % smaller than the reference program's 12, in the time that gzip takes for version 3
 
 
 def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
@@ -140,5 +137,4 @@ _CODES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "log_scales": _scale_codes,
     "quats": lambda planes: smallest_three(planes).astype("<u4"),
     "sh_rest": _sh_rows,
-}
-"""Codes of planes, row by row, for all fields but positions."""
+}  # Codes of planes, row by row, for all fields but positions

@@ -41,12 +41,8 @@ class _Range:
 def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource:
     """Open the level that is asked for, by default the finest whose files are there; see `read_foreign`.
 
-    Raises
-    ------
-    InputError
-        If the level is not there.
-    FormatError
-        If a file is damaged, or ranges do not fit the files that they name.
+    Raises `InputError` if the level is not there. Raises `FormatError` if a file is damaged, or ranges do not fit the
+    files that they name.
     """
     top = parse_object(path.read_bytes(), f"{name}: lod-meta.json")
     if top.has("version"):
@@ -76,14 +72,8 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
 class StreamedSource(DecodedSource):
     """Ranges of rows of several SOG scenes, one behind the other.
 
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    parts : sequence of tuple
-        A scene, its first row and the number of rows of each range; none of them empty.
-    notes : tuple of str
-        Notes of the reader.
+    `name`: what messages call it. `parts`: a scene, its first row and the number of rows of each range; none of them
+    empty. `notes`: notes of the reader.
     """
 
     def __init__(self, name: str, parts: Sequence[tuple[SogSource, int, int]], notes: tuple[str, ...]) -> None:

@@ -26,10 +26,8 @@ from flexgs_edge.scene.rotations import matrices
 from flexgs_edge.scene.source import SceneSource
 
 STREAMED = "lod-meta.json"
-LEAF_ROWS = 1 << 19
-"""Most Gaussians of a part at the finest level. Smaller parts pay for more palettes."""
-_REACH = 3.0
-"""Standard deviations within which a Gaussian counts for the box of its part."""
+LEAF_ROWS = 1 << 19  # Most Gaussians of a part at the finest level. Smaller parts pay for more palettes.
+_REACH = 3.0  # Standard deviations within which a Gaussian counts for the box of its part
 _CHUNK_ROWS = 65536
 
 
@@ -48,16 +46,8 @@ def write_streamed_sog(
 ) -> None:
     """Write the scene into an empty folder.
 
-    Parameters
-    ----------
-    folder : Path
-    source : SceneSource
-        World positions, as `write_sog` takes it; the rows of earlier layers first.
-    layers : sequence of int
-        Gaussians of each layer.
-    writing : Writing
-    preview : SceneSource, optional
-        The scene in far fewer Gaussians, as a level of its own.
+    `source`: world positions, as `write_sog` takes it; the rows of earlier layers first. `layers`: Gaussians of each
+    layer. `preview`: the scene in far fewer Gaussians, as a level of its own.
     """
     writer = _Writer(folder, source, level_counts(layers), writing, preview)
     tree = writer.node(np.arange(source.count), np.arange(writer.preview_means.shape[1]))

@@ -17,30 +17,17 @@ from flexgs_edge.memory.budget import MemoryBudget
 
 @dataclass(frozen=True)
 class KernelSpec:
-    """Where a kernel is found, and how it is launched.
+    """Where a kernel is found, and how it is launched."""
 
-    Parameters
-    ----------
-    file : str
-        Name in `cl_kernels/`; `{form}` is `cpu` or `gpu`.
-    signature : str
-        One letter for each argument: u uint32, i int32, f float32, b array.
-    per : str
-        The work of one item: `rows` (a vector of W rows; the launch size counts rows), `span` (`ROW_SPAN` elements of a
-        picture's row on CPUs, a vector on GPUs; the launch size counts elements), `item` (one of the launch size),
-        `tile` (one work-item a tile on CPUs, a group of 256 on GPUs), `block` (one work-item a block of splats on CPUs, a
-        group on GPUs), `group` (one work-item on CPUs, one group on GPUs).
-    stats : int, optional
-        Kind of statistics, for blends.
-    widest : int
-        Most lanes of a vector.
-    """
-
-    file: str
-    signature: str
+    file: str  # name in `cl_kernels/`; `{form}` is `cpu` or `gpu`
+    signature: str  # one letter for each argument: u uint32, i int32, f float32, b array
+    # The work of one item: `rows` (a vector of W rows; the launch size counts rows), `span` (`ROW_SPAN` elements of a
+    # picture's row on CPUs, a vector on GPUs; the launch size counts elements), `item` (one of the launch size), `tile`
+    # (one work-item a tile on CPUs, a group of 256 on GPUs), `block` (one work-item a block of splats on CPUs, a group
+    # on GPUs), `group` (one work-item on CPUs, one group on GPUs).
     per: str = "item"
-    stats: int | None = None
-    widest: int = 16
+    stats: int | None = None  # kind of statistics, for blends
+    widest: int = 16  # most lanes of a vector
 
 
 _BLEND = "uuiiii" + "fff" + "bbbbb"
@@ -79,15 +66,13 @@ KERNELS: dict[str, KernelSpec] = {
     "follow": KernelSpec("descend.cl", "uufbb", "rows"),
     "snap": KernelSpec("descend.cl", "uubbbbbbbb", "rows"),
     "dequantize": KernelSpec("dequantize.cl", "uuuuuuubbbb"),
-}
-"""Every kernel, by the name that `Backend.launch` and the twins use."""
+}  # Every kernel, by the name that `Backend.launch` and the twins use
 
 CODEC_KERNELS: dict[str, KernelSpec] = {
     "code_chunks": KernelSpec("code_chunks.cl", 11 * "u" + 17 * "b"),
     "encode_chunks": KernelSpec("encode_chunks.cl", "uubbbbbb"),
     "grid_rows": KernelSpec("grid_rows.cl", "uuuuuiiibbbb"),
-}
-"""Kernels of the codec. They have no twins: the codec's own NumPy code is their specification."""
+}  # Kernels of the codec. They have no twins: the codec's own NumPy code is their specification.
 
 
 class Array(Protocol):

@@ -70,8 +70,7 @@ class DeviceInfo:
     self_test: str
     loop_steps: int = 0
     """Steps after which the runtime leaves loops, counted over all loops of a work-item; 0 if it does not."""
-    form: str = ""
-    """Name of the form of the kernels that was measured to be fastest; empty if none was."""
+    form: str = ""  # Name of the form of the kernels that was measured to be fastest; empty if none was
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
     """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
@@ -92,11 +91,8 @@ class DeviceInfo:
 def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     """Every device of every OpenCL platform, in the order of the OpenCL loader.
 
-    Parameters
-    ----------
-    self_test : bool
-        Build and run a small kernel on each device, and compare its result with NumPy's. Before a device is used, it must
-        pass more than this: `flexgs_edge.kernels.tested`.
+    `self_test`: build and run a small kernel on each device, and compare its result with NumPy's. Before a device is
+    used, it must pass more than this: `flexgs_edge.kernels.tested`.
     """
     import pyopencl as cl
 
@@ -197,17 +193,10 @@ def _first_line(text: str) -> str:
 def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
     """Choose the device that `spec` names; returns it with the reason.
 
-    Parameters
-    ----------
-    spec : str or None
-        An index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU
-        that passed the self-test, else PoCL's CPU device, else any other CPU device.
-
-    Raises
-    ------
-    DeviceError
-        If no device matches, or the one that matches failed its self-test; the message lists all devices. We never take
-        another device than the one asked for.
+    `spec`: an index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first
+    GPU that passed the self-test, else PoCL's CPU device, else any other CPU device. Raises `DeviceError` if no device
+    matches, or the one that matches failed its self-test; the message lists all devices. We never take another device
+    than the one asked for.
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:

@@ -16,8 +16,7 @@ KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 """Environment variable with another kernel folder. Tests plant faults in a copy, and expect checks to notice."""
 
 _COMMON = "common.clh"
-_SHARED = (_COMMON, "sh.clh", "activate.clh", "values.clh")
-"""Files of helpers that come before every kernel file."""
+_SHARED = (_COMMON, "sh.clh", "activate.clh", "values.clh")  # Files of helpers that come before every kernel file
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl", "flip.cl")
 _CODEC = ("chunk_streams.clh", "chunk_passes.clh", "code_chunks.cl", "encode_chunks.cl")
 """Files that together make one program of the codec."""
@@ -34,10 +33,7 @@ def kernel_dir() -> Path:
     The order is: the folder that FLEXGS_KERNEL_DIR names; `cl_kernels` inside the installed package (a wheel puts it
     there); `cl_kernels` beside the package (a checkout, an unpacked sdist, an editable install).
 
-    Raises
-    ------
-    DeviceError
-        If that folder holds no `common.clh`.
+    Raises `DeviceError` if that folder holds no `common.clh`.
     """
     override = os.environ.get(KERNEL_DIR_VARIABLE)
     package = Path(__file__).resolve().parents[1]
@@ -106,10 +102,7 @@ def load_source(name: str, stats: int | None = None, form: str = "cpu") -> str:
 
     `#line` directives make the compiler name files and lines that a person can open.
 
-    Raises
-    ------
-    DeviceError
-        If the folder or the file is missing.
+    Raises `DeviceError` if the folder or the file is missing.
     """
     folder = kernel_dir()
     parts = ['#line 1 "constants.py, as printed by flexgs_edge.kernels.cl_sources"\n', constants_header()]

@@ -7,29 +7,18 @@ from dataclasses import dataclass, replace
 
 from flexgs_edge.kernels.choose_device import DeviceInfo
 
-WIDTHS = (16, 8, 4, 1)
-"""Lanes that a vector may have."""
+WIDTHS = (16, 8, 4, 1)  # Lanes that a vector may have
 GPU_WIDTHS = (1, 4)
 """Pixels of a work-item of the GPU form. With 8, llvmpipe was no faster, and took four times as long to build."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """One form of the kernels.
+    """One form of the kernels."""
 
-    Parameters
-    ----------
-    kind : {"cpu", "gpu"}
-        A tile is blended by one work-item, or by one work-group.
-    width : int
-        Lanes of a vector.
-    written_fma : bool
-        Whether `fma` is written out in `common.clh`, for devices whose own one is slow.
-    """
-
-    kind: str
-    width: int
-    written_fma: bool = False
+    kind: str  # a tile is blended by one work-item, or by one work-group
+    width: int  # lanes of a vector
+    written_fma: bool = False  # whether `fma` is written out in `common.clh`, for devices whose own one is slow
 
     def __str__(self) -> str:
         return f"{self.kind}{self.width}{'+fma' if self.written_fma else ''}"

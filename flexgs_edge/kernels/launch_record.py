@@ -22,19 +22,13 @@ devices give it a zero of the wrong sign: docs/devices.md#the-sign-of-zero."""
 
 @dataclass
 class Record:
-    """Launches and what comes before them, in order.
+    """Launches and what comes before them, in order."""
 
-    Parameters
-    ----------
-    steps : list
-        `["array", number, shape, dtype]`, `["write", number, offset, blob]`, `["fill", number, value, rows or None]`,
-        `["release", number]`, `["launch", kernel, size, arguments, outputs]`. An argument is a number, or `[number]` for an
-        array. An output is `[place of the argument, checksum, blob with the right values or None]`.
-    blobs : list of np.ndarray
-        What is written, and right values where no twin can give them.
-    """
-
+    # `["array", number, shape, dtype]`, `["write", number, offset, blob]`, `["fill", number, value, rows or None]`,
+    # `["release", number]`, `["launch", kernel, size, arguments, outputs]`. An argument is a number, or `[number]` for
+    # an array. An output is `[place of the argument, checksum, blob with the right values or None]`.
     steps: list[list[Any]] = field(default_factory=list)
+    # What is written, and right values where no twin can give them.
     blobs: list[np.ndarray] = field(default_factory=list)
 
     def keep(self, values: np.ndarray) -> int:

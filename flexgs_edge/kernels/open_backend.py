@@ -9,18 +9,9 @@ from flexgs_edge.memory.budget import MemoryBudget
 def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
     """Open the backend that `device` names.
 
-    Parameters
-    ----------
-    device : str or None
-        `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We never
-        fall back from one to the other silently.
-    budget : MemoryBudget
-        Counts every array of the backend.
-
-    Raises
-    ------
-    DeviceError
-        If the device does not exist, or failed its self-test.
+    `device`: `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We
+    never fall back from one to the other silently. `budget`: counts every array of the backend. Raises `DeviceError` if
+    the device does not exist, or failed its self-test.
     """
     if device == "numpy":
         return TwinBackend(budget)

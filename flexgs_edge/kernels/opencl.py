@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pyopencl as cl
 
 from flexgs_edge.constants import LANES, ROW_SPAN
@@ -18,50 +14,63 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.cl_sources import load_source
 from flexgs_edge.kernels.form import GPU_WIDTHS, WIDTHS, Form, likely_form, native_width
-from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR, check_steps
-from flexgs_edge.kernels.session import DeviceArray, Session
+from flexgs_edge.kernels.session import Session
 from flexgs_edge.memory.budget import MemoryBudget
 
-SCAN_GROUPS = (1024, 256, 64)
-"""Sizes of the work-group that scans on GPUs: the largest that the device allows."""
-LIST_GROUP = 64
-"""Size of the work-groups that list pairs on GPUs."""
+LIMITED_BLOCKS = 16
+"""Work-items of the serial passes. More would make the scans of their counts longer, which one work-item does."""
+STEPS_A_PAIR = 24
+"""Steps that a pair of splat and tile may take. A blend of the GPU form takes 17 where the compiler leaves its sums a loop;
+`tile_count` takes 7.25: the splat, its row of tiles (1.25), the four block rows of that, the tile."""
+_DIGITS = 2048
+
+
+def steps_of(name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> int:
+    """Steps of the longest work-item of the passes whose steps grow with the scene or the view; 0 for other kernels."""
+    if name == "exclusive_scan":
+        cells, blocks = args[:2]
+        # More than the scan of one work-group takes: a list has room for one pair a tile, and a blend takes all in one tile.
+        return int(cells * (blocks + 2))
+    if name.startswith("sort_"):
+        return int(args[0] // size[0] + _DIGITS)
+    return 0
+
+
+def check_steps(info: DeviceInfo, name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> None:
+    """Refuse a launch whose loops the device would leave early, since its results would be wrong.
+
+    Raises `DeviceError` with what to do.
+    """
+    steps = steps_of(name, size, args)
+    if steps > info.loop_steps:
+        what = "views of fewer pixels" if name == "exclusive_scan" and args[0] != _DIGITS else "a smaller scene"
+        raise DeviceError(
+            f"{info.name} ({info.platform}) leaves loops after {info.loop_steps} steps, and {name} needs {steps}: "
+            f"use another device, or {what}"
+        )
+
+
+SCAN_GROUPS = (1024, 256, 64)  # Sizes of the work-group that scans on GPUs: the largest that the device allows
+LIST_GROUP = 64  # Size of the work-groups that list pairs on GPUs
 GPU_BLOCKS = (64, 256)
 """Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 
 
-class OpenCLBackend:
-    """Kernels and memory of one OpenCL device.
-
-    Parameters
-    ----------
-    info : DeviceInfo
-        The device.
-    budget : MemoryBudget
-        Counts all buffers.
-    width : int, optional
-        Lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1.
-    form : {"cpu", "gpu"}, optional
-        Form of the blend kernel: one work-item a tile, or one work-group a tile.
-    written_fma : bool, optional
-        Whether `fma` is written out.
-
-    By default, all three are what the self-test found to be fastest (`DeviceInfo.form`); if it has not run, they follow
-    the device's type.
-    """
+class OpenCLBackend(Session):
+    """Kernels and memory of one OpenCL device."""
 
     is_numpy = False
 
     def __init__(
         self,
-        info: DeviceInfo,
-        budget: MemoryBudget,
-        width: int | None = None,
-        form: str | None = None,
-        written_fma: bool | None = None,
+        info: DeviceInfo,  # the device
+        budget: MemoryBudget,  # counts all buffers
+        width: int | None = None,  # lanes of a vector: 16, 8, 4 or 1; in the GPU form 4 or 1
+        form: str | None = None,  # form of the blend kernel: one work-item a tile, or one work-group a tile
+        written_fma: bool | None = None,  # whether `fma` is written out
     ) -> None:
         start = time.perf_counter()
-        self.session = Session(info, budget)
+        super().__init__(info, budget)
         chosen = Form.named(info.form) or likely_form(info)
         if form is not None and form != chosen.kind:
             chosen = replace(chosen, kind=form, width=1 if form == "gpu" else native_width(info))
@@ -93,49 +102,9 @@ class OpenCLBackend:
         self._kernels: dict[str, cl.Kernel] = {}
         self.startup_seconds = time.perf_counter() - start
 
-    @property
-    def compile_seconds(self) -> float:
-        """Seconds spent on building programs so far."""
-        return self.session.compile_seconds
-
-    @property
-    def profile(self) -> defaultdict[str, float] | None:
-        """Wall seconds by kernel; None (default) if not measured. Measuring makes every launch wait for the queue."""
-        return self.session.profile
-
-    @profile.setter
-    def profile(self, value: defaultdict[str, float] | None) -> None:
-        self.session.profile = value
-
     def describe(self) -> dict[str, Any]:
         """The device and its settings, for `--json`."""
-        return {"backend": "opencl", **self.session.info.to_json(), "width": self.width, "form": self.form}
-
-    def array(self, shape: tuple[int, ...], dtype: Any) -> DeviceArray:
-        """A new array on the device, not initialised."""
-        return self.session.array(shape, dtype)
-
-    def write(self, array: DeviceArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
-        """Copy `values` to the flat element `offset` of `array`; see `Backend.write`."""
-        self.session.write(array, values, offset, stays)
-
-    def mapped(self, array: DeviceArray) -> AbstractContextManager[np.ndarray]:
-        """Write to `array` on the host; see `Backend.mapped`."""
-        return self.session.mapped(array)
-
-    def mark(self) -> Callable[[], None]:
-        """A function that waits for all kernels launched so far."""
-        return self.session.mark()
-
-    def read(
-        self, array: DeviceArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True
-    ) -> np.ndarray:
-        """Copy `array` to the host, from the flat element `offset` on; see `Backend.read`."""
-        return self.session.read(array, out, offset, waits)
-
-    def fill(self, array: DeviceArray, value: int, count: int | None = None) -> None:
-        """Set every element of `array`, or the first `count` of its rows."""
-        self.session.fill(array, value, count)
+        return {"backend": "opencl", **self.info.to_json(), "width": self.width, "form": self.form}
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
         """Enqueue the kernel `name` over `size` rows, items or tiles."""
@@ -149,7 +118,7 @@ class OpenCLBackend:
             if self._builtins:
                 options.append("-DCLANG_BUILTINS")
             source = load_source(spec.file.format(form=self.form), spec.stats, self.form)
-            self._kernels[name] = self.session.kernel(source, name, tuple(options), spec.signature)
+            self._kernels[name] = self.kernel(source, name, tuple(options), spec.signature)
         local: tuple[int, ...] = (1,) * len(size)
         if spec.per == "span" and self.form == "cpu":
             size = (size[0] // ROW_SPAN,)
@@ -162,11 +131,7 @@ class OpenCLBackend:
             size, local = (size[0] * LIST_GROUP,), (LIST_GROUP,)
         elif spec.per == "group" and self.form == "gpu":
             size = local = (self._scan_group,)
-        if self.session.info.loop_steps:
-            check_steps(self.session.info, name, size, args)
+        if self.info.loop_steps:
+            check_steps(self.info, name, size, args)
         if size[0]:
-            self.session.launch(name, self._kernels[name], size, local, args)
-
-    def close(self) -> None:
-        """Wait for the queue; the owners of buffers release them."""
-        self.session.finish()
+            self.enqueue(name, self._kernels[name], size, local, args)

@@ -13,8 +13,7 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, Backend, TwinBackend
 from flexgs_edge.kernels.launch_record import Record, canonical, checksum
 from flexgs_edge.memory.budget import MemoryBudget
 
-PATTERN = 0xAB
-"""Every byte of a new array, so that elements that are not written are known."""
+PATTERN = 0xAB  # Every byte of a new array, so that elements that are not written are known
 
 
 class WrongResult(Exception):
@@ -59,12 +58,8 @@ class Arrays:
 def play(record: Record, backend: Backend, watch: Callable[[str], None] = lambda kernel: None) -> None:
     """Play `record` on `backend`. A device without threads is spared the kernels of the coder, which no run starts there.
 
-    Raises
-    ------
-    WrongResult
-        With the kernel, the first wrong value, and what was expected.
-    DeviceError, BudgetError
-        From the backend.
+    Raises `WrongResult` with the kernel, the first wrong value, and what was expected. Raises `DeviceError,
+    BudgetError` : From the backend.
     """
     arrays, seen = Arrays(record, backend), set[str]()
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,15 +15,40 @@ import pyopencl as cl
 
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.choose_device import DeviceInfo
-from flexgs_edge.kernels.programs import built_program, context_of
 from flexgs_edge.memory.budget import MemoryBudget
+
+_CONTEXTS: dict[int, cl.Context] = {}  # By device
+_PROGRAMS: dict[tuple[int, str, tuple[str, ...]], tuple[cl.Context, cl.Program]] = {}
+"""By context, source and options. Each keeps its context, so that no other one takes its number."""
+
+
+def context_of(device: cl.Device) -> cl.Context:
+    """The context of `device`; raises `cl.Error`."""
+    if device.int_ptr not in _CONTEXTS:
+        _CONTEXTS[device.int_ptr] = cl.Context([device])
+    return _CONTEXTS[device.int_ptr]
+
+
+def built_program(context: cl.Context, source: str, options: tuple[str, ...]) -> tuple[cl.Program, float]:
+    """The program of `source`, built with `options`, and the seconds that building took: 0 if this process had it.
+
+    Raises `cl.Error` if it does not build.
+    """
+    key, seconds = (context.int_ptr, source, options), 0.0
+    if key not in _PROGRAMS:
+        start = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # CompilerWarning on any build log, such as PoCL's remarks
+            built = cl.Program(context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)  # type: ignore[arg-type]
+        _PROGRAMS[key], seconds = (context, built), time.perf_counter() - start
+    return _PROGRAMS[key][1], seconds
+
 
 SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
 
 FILLED_TOGETHER = (16, 8, 4, 2)
 """Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
-SMALL_WRITE = 1 << 16
-"""Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write"""
+SMALL_WRITE = 1 << 16  # Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write
 HELD_WRITE = 1 << 22
 """Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them:
 docs/results/tuning.md#one_pass"""
@@ -61,12 +87,7 @@ class DeviceArray:
 class Session:
     """Context, in-order queue, kernels and buffers of one device.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-        From `choose_device`.
-    budget : MemoryBudget
-        Counts all buffers.
+    `info`: from `choose_device`. `budget`: counts all buffers.
     """
 
     def __init__(self, info: DeviceInfo, budget: MemoryBudget) -> None:
@@ -83,16 +104,15 @@ class Session:
                 f"{info.name} ({info.platform}) does not open ({error}): it is gone, or its driver is broken; "
                 "`flexgs-edge devices` shows what is there"
             ) from error
-        self.compile_seconds = 0.0
+        self.compile_seconds = 0.0  # spent on building programs so far
+        # Wall seconds by kernel; None (default) if not measured. Measuring makes every launch wait for the queue.
         self.profile: defaultdict[str, float] | None = None
 
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
 
-        Raises
-        ------
-        DeviceError
-            If the program does not build; the message has the device, the options and the compiler's words.
+        Raises `DeviceError` if the program does not build; the message has the device, the options and the compiler's
+        words.
         """
         try:
             program, seconds = built_program(self.context, source, options)
@@ -104,7 +124,7 @@ class Session:
         kernel.set_scalar_arg_dtypes([SCALARS[kind] for kind in signature])
         return kernel
 
-    def launch(
+    def enqueue(
         self, label: str, kernel: cl.Kernel, size: tuple[int, ...], local: tuple[int, ...], args: tuple[Any, ...]
     ) -> None:
         """Enqueue `kernel`; with `profile` set, also wait for it, and add its wall seconds under `label`."""
@@ -193,6 +213,6 @@ class Session:
             pattern = np.full(repeats, value, array.dtype)
             array.changed = cl.enqueue_fill_buffer(self.queue, array.buffer, pattern, 0, size)
 
-    def finish(self) -> None:
-        """Wait for everything that is enqueued."""
+    def close(self) -> None:
+        """Wait for everything that is enqueued; the owners of buffers release them."""
         self.queue.finish()

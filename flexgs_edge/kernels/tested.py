@@ -17,12 +17,9 @@ LOG = logging.getLogger("flexgs_edge")
 
 CHILD = [sys.executable, "-m", "flexgs_edge.kernels.self_test_child"]
 """The command that tests one device. A compiler that crashes ends that process, not ours."""
-MOST_SECONDS = 1800
-"""Time for the test of one device, with all kernels to build. The slowest that we met took 40 s."""
-MARK = "self-test: "
-"""Begins the lines of `CHILD` that are for us; runtimes print other ones."""
-FORM = "form "
-"""Begins what such a line says when another form of the kernels begins; other lines name kernels."""
+MOST_SECONDS = 1800  # Time for the test of one device, with all kernels to build. The slowest that we met took 40 s.
+MARK = "self-test: "  # Begins the lines of `CHILD` that are for us; runtimes print other ones
+FORM = "form "  # Begins what such a line says when another form of the kernels begins; other lines name kernels
 
 _known: dict[str, Verdict] = {}
 _warned: set[str] = set()
@@ -31,11 +28,7 @@ _warned: set[str] = set()
 def with_verdict(info: DeviceInfo, anew: bool = False) -> DeviceInfo:
     """`info` with the verdict of the self-test: a kept one, or that of a test made now.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-    anew : bool
-        Test the device even if there is a verdict.
+    `anew`: test the device even if there is a verdict.
     """
     key = key_of(info)
     verdict = None if anew else _known.get(key) or kept_verdict(key)
@@ -58,10 +51,7 @@ def with_verdict(info: DeviceInfo, anew: bool = False) -> DeviceInfo:
 def choose_tested(spec: str | None) -> tuple[DeviceInfo, str]:
     """Choose a device as `choose_device` does, and test those that are in question, one after the other.
 
-    Raises
-    ------
-    DeviceError
-        As `choose_device`.
+    Raises `DeviceError`: As `choose_device`.
     """
     devices = list_devices(self_test=False)
     while True:

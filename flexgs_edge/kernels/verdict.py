@@ -14,8 +14,7 @@ from flexgs_edge.kernels.choose_device import SELF_TEST, DeviceInfo
 from flexgs_edge.kernels.cl_sources import constants_header, kernel_dir
 from flexgs_edge.kernels.launch_record import RECORD
 
-CACHE_VARIABLE = "FLEXGS_CACHE_DIR"
-"""Environment variable with another folder for what we keep between runs."""
+CACHE_VARIABLE = "FLEXGS_CACHE_DIR"  # Environment variable with another folder for what we keep between runs
 _ABOUT = ("name", "platform", "driver", "opencl_c", "type", "native_width", "max_work_group", "local_bytes")
 
 

@@ -12,12 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.memory.heap import HeapWatch
-from flexgs_edge.memory.process import available_memory, current_rss
+from flexgs_edge.memory.process import HeapWatch, available_memory, current_rss
 from flexgs_edge.units import format_mib
 
-LARGE = 2**20
-"""A stage that takes so many bytes or more has the heaps of this process checked."""
+LARGE = 2**20  # A stage that takes so many bytes or more has the heaps of this process checked
 ROOM = 8 << 20
 """Spare bytes of a limit that an error names. Pages of libraries, heaps of threads and the compiler take some MiB more in one run
 than in the next, mostly on a busy machine: docs/results/tuning.md#foresight"""
@@ -25,18 +23,10 @@ than in the next, mostly on a busy machine: docs/results/tuning.md#foresight"""
 
 @dataclass
 class MemoryBudget:
-    """A memory limit, and the bytes that are taken from it.
+    """A memory limit, and the bytes that are taken from it."""
 
-    Parameters
-    ----------
-    limit : int
-        Bytes that the whole process may hold.
-    used : int
-        Bytes already held; `from_limit` takes the resident memory of the process.
-    """
-
-    limit: int
-    used: int = 0
+    limit: int  # bytes that the whole process may hold
+    used: int = 0  # bytes already held; `from_limit` takes the resident memory of the process
     reclaimers: list[Callable[[int], None]] = field(default_factory=list)
     """Functions to call with the missing bytes before a stage is refused; each lets a cache free memory."""
     evictors: list[Callable[[], None]] = field(default_factory=list)
@@ -60,19 +50,9 @@ class MemoryBudget:
     def rows(self, stage: str, per_row: int, fixed: int = 0, minimum: int = 1, most: int = 1 << 20) -> int:
         """Rows of a chunk for `stage`: as many as fit, at most `most`.
 
-        Parameters
-        ----------
-        stage : str
-            Name of the stage, for the error message.
-        per_row, fixed : int
-            Bytes that the stage needs: for each row, and in any case.
-        minimum, most : int
-            Least and most rows of a chunk.
-
-        Raises
-        ------
-        BudgetError
-            If not even `minimum` rows fit; the message names a sufficient limit.
+        `stage`: name of the stage, for the error message. `per_row`, `fixed`: bytes that the stage needs: for each row,
+        and in any case. `minimum`, `most`: least and most rows of a chunk. Raises `BudgetError` if not even `minimum`
+        rows fit; the message names a sufficient limit.
         """
         rows = min(most, (self.free - fixed) // max(per_row, 1))
         if rows < minimum:

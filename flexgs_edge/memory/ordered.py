@@ -16,14 +16,8 @@ class OrderedPlanes:
     Planes in memory are indexed when they are read. Planes in files are reordered first, one by one; otherwise every
     part would read pages all over every plane.
 
-    Parameters
-    ----------
-    planes : mapping of str to np.ndarray
-        [width, n] of each field.
-    order : np.ndarray or None
-        [n], the row that comes at each place; None keeps the order.
-    storage : Storage
-        Holds the reordered planes.
+    `planes`: [width, n] of each field. `order`: [n], the row that comes at each place; None keeps the order. `storage`:
+    holds the reordered planes.
     """
 
     def __init__(self, planes: Mapping[str, np.ndarray], order: np.ndarray | None, storage: Storage) -> None:
@@ -55,10 +49,7 @@ def stable_order(keys: np.ndarray, storage: Storage = IN_MEMORY, rows: int = 1 <
     We split the keys by value into parts of about equal size, estimated from a sample, and sort one part after the
     other. Equal keys always fall into one part.
 
-    Returns
-    -------
-    np.ndarray
-        [n] i64.
+    Returns [n] i64.
     """
     count = len(keys)
     if not storage.spills or count <= rows:

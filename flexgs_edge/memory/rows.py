@@ -2,27 +2,100 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from contextlib import suppress
+from functools import cache, cached_property, partial
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
-from flexgs_edge.memory.direct import BUFFER_BYTES, DirectFile, is_cached
+BUFFER_BYTES = 1 << 21
+"""Bytes of the buffer of each thread that reads past the cache: one huge page. Disks fill scattered small pages more
+slowly: docs/results/tuning.md#disks"""
+_HELD = threading.local()
 
-BLOCK_ROWS = 1 << 14
-"""Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes."""
-AHEAD_ROWS = 1 << 15
-"""Rows that are read ahead at a time."""
-COPY_ROWS = 1 << 18
-"""Rows of one plane that are copied at a time: a megabyte of f32."""
-DENSE = 4
-"""Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page."""
-READERS = 4
-"""Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks"""
+
+class DirectFile:
+    """A second descriptor of an open file, which reads past the cache."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    @classmethod
+    def of(cls, file: BinaryIO) -> DirectFile | None:
+        """Open `file` again; None if the system or the disk does not support it."""
+        with suppress(OSError, AttributeError):
+            return cls(os.open(f"/proc/self/fd/{file.fileno()}", os.O_RDONLY | os.O_DIRECT))
+        return None
+
+    def read(self, at: int, out: memoryview) -> None:
+        """Fill `out` (bytes) from byte `at` of the file; raises `EOFError` if the file is too short."""
+        buffer = _buffer()
+        while out:
+            # O_DIRECT takes only offsets and sizes in whole blocks of the disk; a page is a multiple of them.
+            start = at // mmap.PAGESIZE * mmap.PAGESIZE
+            end = min(-(-(at + len(out)) // mmap.PAGESIZE) * mmap.PAGESIZE, start + BUFFER_BYTES)
+            got = os.preadv(self._descriptor, [buffer[: end - start]], start)
+            part = buffer[at - start : min(got, at - start + len(out))]
+            if not part:
+                raise EOFError(f"a scratch file ends at byte {start + got}")
+            out[: len(part)] = part
+            out, at = out[len(part) :], at + len(part)
+
+    def close(self) -> None:
+        """Close the second descriptor."""
+        os.close(self._descriptor)
+
+
+def _buffer() -> memoryview:
+    """The read buffer of the current thread."""
+    if not hasattr(_HELD, "buffer"):
+        pages = mmap.mmap(-1, 2 * BUFFER_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)  # shared: no huge pages
+        if hasattr(mmap, "MADV_HUGEPAGE"):
+            with suppress(OSError):
+                pages.madvise(mmap.MADV_HUGEPAGE)
+        first = -np.frombuffer(pages, np.uint8).ctypes.data % BUFFER_BYTES
+        _HELD.buffer = memoryview(pages)[first : first + BUFFER_BYTES]
+    held: memoryview = _HELD.buffer
+    return held
+
+
+def is_cached(address: int, size: int) -> bool:
+    """Whether the page cache seems to hold `size` bytes of a file mapped at `address`.
+
+    It is True if the system does not tell. We ask for the first and the last page only, since neighbours come and go
+    together. A wrong answer costs time, no data.
+    """
+    library = _library()
+    if library is None:
+        return True
+    held = ctypes.c_ubyte()
+    for place in (address, address + max(size - 1, 0)):
+        told = library.mincore(place // mmap.PAGESIZE * mmap.PAGESIZE, 1, ctypes.byref(held)) == 0
+        if told and not held.value & 1:  # the other bits are undefined
+            return False
+    return True
+
+
+@cache
+def _library() -> ctypes.CDLL | None:
+    with suppress(OSError, TypeError, AttributeError):
+        library = ctypes.CDLL(None)
+        library.mincore.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p
+        return library
+    return None
+
+
+BLOCK_ROWS = 1 << 14  # Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes
+AHEAD_ROWS = 1 << 15  # Rows that are read ahead at a time
+COPY_ROWS = 1 << 18  # Rows of one plane that are copied at a time: a megabyte of f32
+DENSE = 4  # Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page
+READERS = 4  # Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks
 _READING = ThreadPoolExecutor(READERS, "read")
 _TAKING = ThreadPoolExecutor(2, "take")
 """Threads that take listed rows: while one plane is read or written, another is indexed."""
@@ -35,8 +108,7 @@ _Piece = tuple[DirectFile, int, memoryview]
 class _Owner(Protocol):
     """The storage that a mapped file belongs to."""
 
-    used: int
-    """Bytes of all its mapped files."""
+    used: int  # Bytes of all its mapped files
 
     def full(self, size: int, error: OSError) -> Exception:
         """The error to raise if the disk has no room for `size` bytes."""
@@ -71,12 +143,7 @@ def blocks(count: int, rows: int = BLOCK_ROWS) -> Iterator[slice]:
 def fetch(values: np.ndarray, rows: slice) -> None:
     """Ask the kernel to read rows of every plane of a mapped array at once; no effect on arrays in memory.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n].
-    rows : slice
-        `slice(start, stop)`.
+    `values`: [..., n]. `rows`: `slice(start, stop)`.
     """
     held = map_of(values)
     if held is None or not hasattr(mmap, "MADV_WILLNEED"):
@@ -93,14 +160,7 @@ def fetch(values: np.ndarray, rows: slice) -> None:
 def copy_rows(values: np.ndarray, rows: slice, out: np.ndarray) -> None:
     """Copy `values[..., rows]` to `out`; a mapped array is read from its file, without the interpreter's lock.
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n], planes C-contiguous.
-    rows : slice
-        `slice(start, stop)`.
-    out : np.ndarray
-        [..., stop - start], of the same type.
+    `values`: [..., n], planes C-contiguous. `rows`: `slice(start, stop)`. `out`: [..., stop - start], of the same type.
     """
     copy_all_rows([(values, out)], rows)
 
@@ -185,16 +245,8 @@ def take_rows(values: np.ndarray, rows: np.ndarray, out: np.ndarray, whole_bytes
     For files, rows out of order are taken plane by plane, two planes at a time, so that memory holds the planes in use.
     A loop over parts of the rows would read all planes once a part: docs/results/tuning.md#disks
 
-    Parameters
-    ----------
-    values : np.ndarray
-        [..., n].
-    rows : np.ndarray
-        [m], row numbers in any order.
-    out : np.ndarray
-        [..., m], of the same type.
-    whole_bytes : int
-        Bytes of the largest plane that may be held in memory as a whole; two are held at a time.
+    `values`: [..., n]. `rows`: [m], row numbers in any order. `out`: [..., m], of the same type. `whole_bytes`: bytes
+    of the largest plane that may be held in memory as a whole; two are held at a time.
     """
     planes = [(values[place], out[place]) for place in np.ndindex(values.shape[:-1])]
     if not planes:

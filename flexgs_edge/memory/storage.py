@@ -23,8 +23,7 @@ LEAST_BYTES = 1 << 16
 WHOLE_BYTES = 1 << 26
 """Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a
 read of its own: docs/results/tuning.md#disks"""
-WHOLE_SHARE = 16
-"""Such a plane may be as large as this part of the limit (one in 16), if that is more."""
+WHOLE_SHARE = 16  # Such a plane may be as large as this part of the limit (one in 16), if that is more
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
@@ -36,10 +35,8 @@ class Storage:
     """Whether arrays lie in files. Then memory need hold only a few bytes for each row; the page cache takes what is
     free."""
     folder: Path | None = None
-    whole_bytes = WHOLE_BYTES
-    """Bytes of the largest plane to hold as a whole; see `take_rows`."""
-    peak = 0
-    """Most bytes that lay in files at one time."""
+    whole_bytes = WHOLE_BYTES  # Bytes of the largest plane to hold as a whole; see `take_rows`
+    peak = 0  # Most bytes that lay in files at one time
 
     @property
     def peak_anonymous(self) -> int | None:
@@ -88,22 +85,9 @@ class ScratchStorage(Storage):
     The files have no names, so their disk space is free again however the process ends. Their blocks are reserved
     before use, so that a full disk raises an error instead of a signal in the middle of a copy.
 
-    Parameters
-    ----------
-    folder : path
-        On a disk.
-    limit : int
-        Bytes that the process may hold; larger limits let larger planes be held as a whole.
-    least : int
-        Arrays of fewer bytes always stay in memory.
-    whole : int
-        See `WHOLE_BYTES`.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should
-        save).
+    `folder`: on a disk. `limit`: bytes that the process may hold; larger limits let larger planes be held as a whole.
+    `least`: arrays of fewer bytes always stay in memory. `whole`: see `WHOLE_BYTES`. Raises `InputError` if the folder
+    does not exist, cannot be written to, or lies in memory (a tmpfs would take the memory it should save).
     """
 
     spills = True

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MAX_BITS = 16
-"""Most bits of a code: two bytes."""
+MAX_BITS = 16  # Most bits of a code: two bytes
 
 
 def plane_bytes(rows: int, bits: int) -> int:
@@ -24,17 +23,7 @@ def plane_bytes(rows: int, bits: int) -> int:
 def pack(codes: np.ndarray, bits: int) -> np.ndarray:
     """Pack codes into bytes; unused bits of the last byte are zero.
 
-    Parameters
-    ----------
-    codes : np.ndarray
-        [n] u16, each below 2^bits (higher bits are not masked).
-    bits : int
-        1 to 16.
-
-    Returns
-    -------
-    np.ndarray
-        [ceil(n * bits / 8)] u8.
+    `codes`: [n] u16, each below 2^bits (higher bits are not masked). `bits`: 1 to 16. Returns [ceil(n * bits / 8)] u8.
     """
     n = len(codes)
     if bits == 16:
@@ -61,19 +50,8 @@ def pack(codes: np.ndarray, bits: int) -> np.ndarray:
 def unpack(plane: np.ndarray, bits: int, start: int, stop: int) -> np.ndarray:
     """Unpack the codes of rows [start, stop) of a plane.
 
-    Parameters
-    ----------
-    plane : np.ndarray
-        [bytes] u8, contiguous, from `pack`.
-    bits : int
-        1 to 16.
-    start, stop : int
-        Rows, 0 <= start <= stop <= rows of the plane.
-
-    Returns
-    -------
-    np.ndarray
-        [stop - start] u16.
+    `plane`: [bytes] u8, contiguous, from `pack`. `bits`: 1 to 16. `start`, `stop`: rows, 0 <= start <= stop <= rows of
+    the plane. Returns [stop - start] u16.
     """
     if stop <= start:
         return np.zeros(0, np.uint16)

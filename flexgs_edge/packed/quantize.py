@@ -23,14 +23,13 @@ from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.scene.contraction import LARGEST, Contraction, densest
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
-from flexgs_edge.scene.sample import SAMPLE_ROWS, some_positions
+from flexgs_edge.scene.source import SAMPLE_ROWS, some_positions
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource
 
 
-FINER = 128
-"""Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide."""
+FINER = 128  # Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide
 SMALLEST_STEP = 2.0**-126
 """Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
 
@@ -66,26 +65,16 @@ def group_of(row: int, rows: int, groups: int) -> int:
 class QuantizedArray:
     """The bit-packed codes of one field, and the range of each group.
 
-    Parameters
-    ----------
-    bits : int
-        Bits per code, 1 to 16.
-    count : int
-        Rows.
-    channels : int
-        Channels (planes).
-    low, step : np.ndarray
-        [channels, G] f32.
-    planes : np.ndarray
-        [channels, ceil(count * bits / 8)] u8; the code of row i starts at bit i * bits of its plane, least
-        significant bit first.
+    `low`, `step`: [channels, G] f32.
     """
 
-    bits: int
-    count: int
-    channels: int
+    bits: int  # bits per code, 1 to 16
+    count: int  # rows
+    channels: int  # channels (planes)
     low: np.ndarray
     step: np.ndarray
+    # [channels, ceil(count * bits / 8)] u8; the code of row i starts at bit i * bits of its plane, least significant
+    # bit first.
     planes: np.ndarray
 
     @property
@@ -103,25 +92,16 @@ class QuantizedArray:
 class QuantizedScene:
     """A quantized scene; rows [0, sh_count) have SH, the others have none.
 
-    Parameters
-    ----------
-    count, sh_count : int
-        Rows, and rows with SH.
-    sh_degree : int
-        0 if no row has SH.
-    origin : np.ndarray
-        [3] f64, world: positions are relative to it.
-    arrays : dict
-        One `QuantizedArray` for each scene field; `sh_rest` has `sh_count` rows, the others have `count`.
-    contraction : Contraction, optional
-        Of the positions that the codes stand for. Default: they are not contracted.
+    `count`, `sh_count`: rows, and rows with SH.
     """
 
     count: int
     sh_count: int
-    sh_degree: int
-    origin: np.ndarray
+    sh_degree: int  # 0 if no row has SH
+    origin: np.ndarray  # [3] f64, world: positions are relative to it
+    # One `QuantizedArray` for each scene field; `sh_rest` has `sh_count` rows, the others have `count`.
     arrays: dict[str, QuantizedArray]
+    # Of the positions that the codes stand for. Default: they are not contracted.
     contraction: Contraction | None = None
 
     @property
@@ -153,10 +133,7 @@ def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray
 
     `values`: [c, n] f32, finite, magnitudes up to `LARGEST`.
 
-    Raises
-    ------
-    InputError
-        If a value is not finite or too large.
+    Raises `InputError` if a value is not finite or too large.
     """
     values = np.asarray(values, np.float32)
     channels, rows = values.shape
@@ -176,10 +153,7 @@ def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
 def dequantize(array: QuantizedArray, rows: slice) -> np.ndarray:
     """Values of `rows` (a slice with step 1); this is the specification of every dequantizer.
 
-    Returns
-    -------
-    np.ndarray
-        [c, n] f32, lo + code * step: first the product is rounded to float32, then the sum.
+    Returns [c, n] f32, lo + code * step: first the product is rounded to float32, then the sum.
     """
     return dequantize_part(array, 0, rows)
 
@@ -209,10 +183,7 @@ def largest_error(array: QuantizedArray) -> np.ndarray:
     It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code *
     step and of the sum. Each rounding is at most 2^-24 of the largest number in it.
 
-    Returns
-    -------
-    np.ndarray
-        [c, G] f64.
+    Returns [c, G] f64.
     """
     low, step = array.low.astype(np.float64), array.step.astype(np.float64)
     span = step * (2**array.bits - 1)
@@ -223,30 +194,20 @@ def largest_error(array: QuantizedArray) -> np.ndarray:
 
 
 def quantize_scene(
-    source: SceneSource,
+    source: SceneSource,  # a checked scene (finite values, no zero quaternions)
     rows_with_sh: np.ndarray,
     rows_without_sh: np.ndarray,
-    bits: BitSpec = PAPER,
+    bits: BitSpec = PAPER,  # bits per code
     groups: int | None = None,
-    chunk_rows: int = 65536,
+    chunk_rows: int = 65536,  # rows held in memory at a time, beside the packed result
     contraction: Contraction | None = None,
 ) -> QuantizedScene:
     """Quantize the chosen rows of a scene; the result does not depend on `chunk_rows`.
 
-    Parameters
-    ----------
-    source : SceneSource
-        A checked scene (finite values, no zero quaternions).
-    rows_with_sh, rows_without_sh : np.ndarray
-        [n] i64 ascending, from `select_rows`, stored in this order. At SH degree 0, no row counts as one with SH.
-    bits : BitSpec
-        Bits per code.
-    groups : int, optional
-        Groups per channel of every array; by default about one for 512 rows. 1 is plain round to nearest.
-    chunk_rows : int
-        Rows held in memory at a time, beside the packed result.
-    contraction : Contraction, optional
-        From `far_contraction`. Rows are then stored by distance, so that few groups hold near and far ones.
+    `rows_with_sh`, `rows_without_sh`: [n] i64 ascending, from `select_rows`, stored in this order. At SH degree 0, no
+    row counts as one with SH. `groups`: groups per channel of every array; by default about one for 512 rows. 1 is
+    plain round to nearest. `contraction`: from `far_contraction`. Rows are then stored by distance, so that few groups
+    hold near and far ones.
     """
     if source.sh_degree == 0 and len(rows_with_sh):
         rows_without_sh = np.sort(np.concatenate([rows_with_sh, rows_without_sh]))
@@ -283,12 +244,7 @@ def far_contraction(source: SceneSource, chunk_rows: int = 65536) -> Contraction
     It needs one if a step of 16 bits over the whole scene is longer than half of its Gaussians are wide (their middle axis). The
     radius is the longest at which steps are `FINER` times shorter than that.
 
-    Parameters
-    ----------
-    source : SceneSource
-        A checked scene.
-    chunk_rows : int
-        Rows held in memory at a time.
+    `source`: a checked scene. `chunk_rows`: rows held in memory at a time.
     """
     low, high, widths, every = np.full(3, np.inf), np.full(3, -np.inf), [], max(source.count // SAMPLE_ROWS, 1)
     for rows in source.chunks(chunk_rows):

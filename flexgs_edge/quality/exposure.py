@@ -12,8 +12,7 @@ import numpy as np
 
 from flexgs_edge.quality.psnr import drop, mse
 
-DARK, BRIGHT = 2 / 255, 253 / 255
-"""Values outside these may be clipped, and tell no gain."""
+DARK, BRIGHT = 2 / 255, 253 / 255  # Values outside these may be clipped, and tell no gain
 FIT_PIXELS = 1 << 16
 """Every n-th pixel in both directions is fitted, so that at least this many are, or all of a smaller picture."""
 LEAST_GAIN = 0.5
@@ -25,17 +24,8 @@ def exposure_gains(image: np.ndarray, photo: np.ndarray) -> np.ndarray | None:
 
     Of each channel, least squares in linear light over the pixels where neither is clipped.
 
-    Parameters
-    ----------
-    image : np.ndarray
-        Render of the original, [H, W, 3] f32, sRGB in [0, 1].
-    photo : np.ndarray
-        The photo, [H, W, 3] f32, sRGB in [0, 1].
-
-    Returns
-    -------
-    np.ndarray or None
-        [3] f64, above 0, for red, green and blue.
+    `image`: render of the original, [H, W, 3] f32, sRGB in [0, 1]. `photo`: the photo, [H, W, 3] f32, sRGB in [0, 1].
+    Returns [3] f64, above 0, for red, green and blue.
     """
     height, width, _ = image.shape
     step = max(isqrt(height * width // FIT_PIXELS), 1)

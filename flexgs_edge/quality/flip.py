@@ -14,8 +14,7 @@ from flexgs_edge.kernels.backend import Backend
 
 FILTERS = 7
 """Filters of a direction: light, red against green, yellow against blue (two parts), and light for features (three)."""
-SEEN = 5
-"""Values of a pixel that are compared: colour (three), edges and points."""
+SEEN = 5  # Values of a pixel that are compared: colour (three), edges and points
 BAND = 1 << 16
 """Most elements of a band of rows, so that all planes together take 8 MB, and one fits a core's cache. Values do not
 depend on bands. docs/results/tuning.md#flip"""
@@ -75,15 +74,8 @@ def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
     FLIP says how different two images look to somebody who flips between them: 0 for equal ones, at most 1. It assumes
     `FLIP_DEGREE` pixels per degree.
 
-    Parameters
-    ----------
-    pairs : sequence of two arrays
-        [H, W, 3] f32, sRGB; clamped to [0, 1] here. An image that is in several pairs is filtered once.
-
-    Returns
-    -------
-    list of np.ndarray
-        [H, W] f32 for each pair.
+    `pairs`: [H, W, 3] f32, sRGB; clamped to [0, 1] here. An image that is in several pairs is filtered once. Returns
+    [H, W] f32 for each pair.
     """
     images = list({id(image): image for pair in pairs for image in pair}.values())
     if any(image.shape != images[0].shape for image in images):

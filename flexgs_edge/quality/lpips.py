@@ -13,13 +13,11 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss
 
-LPIPS_SIDE = 31
-"""Smallest side of an image: AlexNet's five layers then leave one pixel."""
+LPIPS_SIDE = 31  # Smallest side of an image: AlexNet's five layers then leave one pixel
 LOAD_BYTES = 1100 * 2**20
 """Bound on the memory that loading takes at its peak: the libraries, and two copies of the weights.
 docs/results/tuning.md#memory"""
-WORK_BYTES = 300
-"""Bound on the bytes a pixel that a comparison takes for a moment: docs/results/tuning.md#memory"""
+WORK_BYTES = 300  # Bound on the bytes a pixel that a comparison takes for a moment: docs/results/tuning.md#memory
 BACKBONE = "alexnet-owt-7be5be79.pth"
 """torchvision's file of AlexNet's weights, 244 MB; the package `lpips` holds its own weights."""
 BACKBONE_URL = f"https://download.pytorch.org/models/{BACKBONE}"
@@ -28,19 +26,9 @@ BACKBONE_URL = f"https://download.pytorch.org/models/{BACKBONE}"
 class Lpips:
     """Perceptual distance of two images: 0 for identical ones, smaller is better (AlexNet, version 0.1, on the CPU).
 
-    Parameters
-    ----------
-    budget : MemoryBudget
-        Memory for the libraries and for images of `pixels` pixels is taken from it until `close`.
-    pixels : int
-        Pixels of the largest image.
-
-    Raises
-    ------
-    InputError
-        If a package or the weights of AlexNet are missing; the message tells what to install, or where to put the file.
-    BudgetError
-        If they do not fit into the memory limit.
+    `budget`: memory for the libraries and for images of `pixels` pixels is taken from it until `close`. `pixels`:
+    pixels of the largest image. Raises `InputError` if a package or the weights of AlexNet are missing; the message
+    tells what to install, or where to put the file. Raises `BudgetError` if they do not fit into the memory limit.
     """
 
     def __init__(self, budget: MemoryBudget, pixels: int) -> None:

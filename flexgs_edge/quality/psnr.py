@@ -22,8 +22,7 @@ for pictures of any height."""
 _BANDS = ThreadPoolExecutor(BANDS, "bands")
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
-BLIND_DROP = 1.0
-"""A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`."""
+BLIND_DROP = 1.0  # A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -90,12 +89,8 @@ def modelled_drop(error: float, base_psnr: float = DEFAULT_BASE_PSNR) -> float:
 
     The model assumes that this error is independent of the original's own error.
 
-    Parameters
-    ----------
-    error : float
-        Mean squared error against the original's renders.
-    base_psnr : float
-        Assumed PSNR of the original against its photos, dB.
+    `error`: mean squared error against the original's renders. `base_psnr`: assumed PSNR of the original against its
+    photos, dB.
 
     >>> round(modelled_drop(mse_of_psnr(41.87), 36.0), 2)
     1.0
@@ -131,14 +126,8 @@ def far_bases(
     A photo cannot judge if a picture of one colour would lose less than `BLIND_DROP` against it, or if an error that costs
     this much there is larger than that of the original in the usual view.
 
-    Parameters
-    ----------
-    original_errors : sequence of float
-        Mean squared error of the original against the photo of each view.
-    contrasts : sequence of float
-        `contrast` of each photo.
-    base_psnr : float
-        Largest base, dB, and the base if most photos do not show what their cameras saw.
+    `original_errors`: mean squared error of the original against the photo of each view. `contrasts`: `contrast` of
+    each photo. `base_psnr`: largest base, dB, and the base if most photos do not show what their cameras saw.
 
     >>> [base and round(base, 1) for base in far_bases([1e-3, 1e-3, 2e-2, 1e-3], [3e-2, 3e-2, 3e-2, 1e-3])]
     [None, None, 30.0, 30.0]

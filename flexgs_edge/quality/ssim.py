@@ -10,8 +10,7 @@ from flexgs_edge.constants import LANES, SSIM_WINDOW
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.window import window
 
-LOST_SHARE = 0.7
-"""SSIM lost against photos, as a share of what is lost against the original's renders."""
+LOST_SHARE = 0.7  # SSIM lost against photos, as a share of what is lost against the original's renders
 
 
 def modelled_ssim_drop(unlike: float) -> float:
@@ -37,15 +36,7 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
     It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the
     image. scikit-image gives the same with `gaussian_weights=True, use_sample_covariance=False, data_range=1`.
 
-    Parameters
-    ----------
-    pairs : sequence of two arrays
-        [H, W, 3] f32; clamped to [0, 1] here.
-
-    Returns
-    -------
-    list of float or None
-        `None` for images with a side below 11 pixels.
+    `pairs`: [H, W, 3] f32; clamped to [0, 1] here. Returns `None` for images with a side below 11 pixels.
     """
     if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
         return [None] * len(pairs)

@@ -22,8 +22,7 @@ Distance = Callable[[np.ndarray, np.ndarray], float | None]
 LEAST_COVERAGE = 0.1
 """The worst view by covered figures has at least this share of the mean coverage. Views that see a few faint pixels have
 large errors relative to them, and nobody would see these."""
-ALIKE = 48.0
-"""Fidelity in dB from which on more of it shows nothing: an error of one level of 255."""
+ALIKE = 48.0  # Fidelity in dB from which on more of it shows nothing: an error of one level of 255
 Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
 """Figures of pairs of [H, W, 3] images, all of one size."""
 
@@ -32,30 +31,15 @@ Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | N
 class ViewQuality:
     """Quality of one view. PSNRs are in dB, and `None` if images are identical or one of them is missing.
 
-    Parameters
-    ----------
-    name : str
-        Name of the view.
-    error : float
-        Mean squared error against the original's render.
-    photo_error, original_error : float or None
-        Mean squared error of this render, and of the original's render, against the photo; `None` without a photo.
-    ssim_original, ssim_photo, original_ssim : float or None
-        SSIM against the original's render, against the photo, and of the original against the photo.
-    lpips_original, lpips_photo, original_lpips : float or None
-        LPIPS of the same three pairs; `None` unless it was asked for.
-    flip_original, flip_photo, original_flip : float or None
-        FLIP of the same three pairs, mean over the pixels.
-    coverage : float
-        Share of the picture that the original covers, 0 to 1: the mean over the pixels of its accumulated alpha.
-    far_base : float or None
-        Base of the modelled drop by which the view counts, dB, if the original is far from its photo (`far_bases`).
-    exposure : tuple of float or None
-        Stops of red, green and blue by which the photo was brightened to the exposure of the original.
+    `photo_error`, `original_error`: mean squared error of this render, and of the original's render, against the photo;
+    `None` without a photo. `ssim_original`, `ssim_photo`, `original_ssim`: SSIM against the original's render, against
+    the photo, and of the original against the photo. `lpips_original`, `lpips_photo`, `original_lpips`: LPIPS of the
+    same three pairs; `None` unless it was asked for. `flip_original`, `flip_photo`, `original_flip`: FLIP of the same
+    three pairs, mean over the pixels.
     """
 
-    name: str
-    error: float
+    name: str  # name of the view
+    error: float  # mean squared error against the original's render
     photo_error: float | None = None
     original_error: float | None = None
     ssim_original: float | None = None
@@ -67,8 +51,11 @@ class ViewQuality:
     flip_original: float | None = None
     flip_photo: float | None = None
     original_flip: float | None = None
+    # Share of the picture that the original covers, 0 to 1: the mean over the pixels of its accumulated alpha.
     coverage: float = 1.0
+    # Base of the modelled drop by which the view counts, dB, if the original is far from its photo (`far_bases`).
     far_base: float | None = None
+    # Stops of red, green and blue by which the photo was brightened to the exposure of the original.
     exposure: tuple[float, ...] | None = None
 
     @property
@@ -116,54 +103,35 @@ class ViewQuality:
         return max(self.original_ssim - self.ssim_photo, 0.0)
 
 
+class _MeanOf:
+    """The mean over the views of their figure of this name; `None` where no view has it."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, quality: Quality, owner: type) -> float | None:
+        return mean_psnr([getattr(view, self._name) for view in quality.views])
+
+
 @dataclass(frozen=True)
 class Quality:
-    """Quality of a scene over its evaluation views: means over the views, and the worst view.
+    """Quality of a scene over its evaluation views: means over the views, and the worst view."""
 
-    Parameters
-    ----------
-    views : tuple of ViewQuality
-        One record for each view, sorted by name.
-    base_psnr : float
-        Assumed PSNR of the original against photos, for the modelled drop, dB.
-    covered_decides : bool
-        The covered figures decide: there are no photos. Default: the plain figures decide.
-    made : Quality or None
-        Quality at made poses, where no given camera stood; `None` if not measured.
-    """
+    views: tuple[ViewQuality, ...]  # one record for each view, sorted by name
+    base_psnr: float = DEFAULT_BASE_PSNR  # assumed PSNR of the original against photos, for the modelled drop, dB
+    covered_decides: bool = False  # The covered figures decide: there are no photos. Default: the plain figures decide.
+    made: Quality | None = None  # quality at made poses, where no given camera stood; `None` if not measured
 
-    views: tuple[ViewQuality, ...]
-    base_psnr: float = DEFAULT_BASE_PSNR
-    covered_decides: bool = False
-    made: Quality | None = None
-
-    def _mean(self, name: str) -> float | None:
-        return mean_psnr([getattr(view, name) for view in self.views])
+    fidelity = _MeanOf()  # against the original's renders, dB; `None` if every view is identical
+    psnr, original_psnr, drop = _MeanOf(), _MeanOf(), _MeanOf()  # against the photos, dB; `None` without photos
+    ssim_original, ssim_photo, original_ssim = _MeanOf(), _MeanOf(), _MeanOf()
+    lpips_original, lpips_photo, original_lpips = _MeanOf(), _MeanOf(), _MeanOf()
+    flip_original, flip_photo, original_flip = _MeanOf(), _MeanOf(), _MeanOf()
 
     @property
     def error(self) -> float:
         """Mean squared error against the original's renders, mean over the views."""
         return math.fsum(view.error for view in self.views) / max(len(self.views), 1)
-
-    @property
-    def fidelity(self) -> float | None:
-        """Mean PSNR against the original's renders, dB; `None` if every view is identical."""
-        return self._mean("fidelity")
-
-    @property
-    def psnr(self) -> float | None:
-        """Mean PSNR against the photos, dB."""
-        return self._mean("psnr")
-
-    @property
-    def original_psnr(self) -> float | None:
-        """Mean PSNR of the original against the photos, dB."""
-        return self._mean("original_psnr")
-
-    @property
-    def drop(self) -> float | None:
-        """Mean drop against the photos, dB; `None` without photos."""
-        return self._mean("drop")
 
     @property
     def modelled_drop(self) -> float:
@@ -250,21 +218,6 @@ class Quality:
         return sum(view.error == 0.0 for view in self.views)
 
     @property
-    def ssim_original(self) -> float | None:
-        """Mean SSIM against the original's renders."""
-        return self._mean("ssim_original")
-
-    @property
-    def ssim_photo(self) -> float | None:
-        """Mean SSIM against the photos."""
-        return self._mean("ssim_photo")
-
-    @property
-    def original_ssim(self) -> float | None:
-        """Mean SSIM of the original against the photos."""
-        return self._mean("original_ssim")
-
-    @property
     def by_loss(self) -> list[int]:
         """Indices of the views, the worst first: by drop if all have photos, else by the error that decides.
 
@@ -281,36 +234,6 @@ class Quality:
         return sorted(range(len(losses)), key=lambda index: -losses[index])
 
     @property
-    def lpips_original(self) -> float | None:
-        """Mean LPIPS against the original's renders."""
-        return self._mean("lpips_original")
-
-    @property
-    def lpips_photo(self) -> float | None:
-        """Mean LPIPS against the photos."""
-        return self._mean("lpips_photo")
-
-    @property
-    def original_lpips(self) -> float | None:
-        """Mean LPIPS of the original against the photos."""
-        return self._mean("original_lpips")
-
-    @property
-    def flip_original(self) -> float | None:
-        """Mean FLIP against the original's renders."""
-        return self._mean("flip_original")
-
-    @property
-    def flip_photo(self) -> float | None:
-        """Mean FLIP against the photos."""
-        return self._mean("flip_photo")
-
-    @property
-    def original_flip(self) -> float | None:
-        """Mean FLIP of the original against the photos."""
-        return self._mean("original_flip")
-
-    @property
     def worst_flip(self) -> ViewQuality | None:
         """The view with the largest FLIP against the original's render; `None` if it was not measured."""
         known = [view for view in self.views if view.flip_original is not None]
@@ -323,39 +246,21 @@ class Quality:
 
 
 def compare_view(
-    name: str,
+    name: str,  # name of the view
     image: np.ndarray,
     original: np.ndarray,
-    photo: np.ndarray | None = None,
-    original_error: float | None = None,
-    original_ssim: float | None = None,
-    ssims: Figures | None = None,
+    photo: np.ndarray | None = None,  # the photo, [H, W, 3] f32 in [0, 1]
+    original_error: float | None = None,  # mean squared error of `original` against `photo`, if it is known already
+    original_ssim: float | None = None,  # SSIM of the same two, if it is known already
+    ssims: Figures | None = None,  # measures the similarity of all pairs of images; by default SSIM is left out
     lpips: Distance | None = None,
-    coverage: float = 1.0,
-    flips: Figures | None = None,
+    coverage: float = 1.0,  # Share of the picture that the original covers. Default: all of it.
+    flips: Figures | None = None,  # measures FLIP of all pairs of images; left out by default
 ) -> ViewQuality:
     """Measure the quality of one render.
 
-    Parameters
-    ----------
-    name : str
-        Name of the view.
-    image, original : np.ndarray
-        Renders of the compressed scene and of the original, [H, W, 3] f32, not clamped.
-    photo : np.ndarray, optional
-        The photo, [H, W, 3] f32 in [0, 1].
-    original_error : float, optional
-        Mean squared error of `original` against `photo`, if it is known already.
-    original_ssim : float, optional
-        SSIM of the same two, if it is known already.
-    ssims : callable, optional
-        Measures the similarity of all pairs of images; by default SSIM is left out.
-    lpips : callable, optional
-        Measures a distance of all pairs of images; left out by default. LPIPS takes seconds for each pair.
-    coverage : float
-        Share of the picture that the original covers. Default: all of it.
-    flips : callable, optional
-        Measures FLIP of all pairs of images; left out by default.
+    `image`, `original`: renders of the compressed scene and of the original, [H, W, 3] f32, not clamped. `lpips`:
+    measures a distance of all pairs of images; left out by default. LPIPS takes seconds for each pair.
     """
     if photo is not None and original_error is None:
         original_error = mse(original, photo)

@@ -12,18 +12,93 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
-from typing import BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.constants import CULLED, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.render.camera_record import camera_record
-from flexgs_edge.render.compact import ShownView, Splats, fill_compact
+from flexgs_edge.render.chunk_bounds import ChunkBounds
+from flexgs_edge.render.chunks import ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
 from flexgs_edge.render.view_buffers import ViewBuffers
+
+Splats = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Splats that a view shows: records [m, 16] f32, depth keys and bounds of tiles [m] u32, rows of the scene [m] u32."""
+
+
+class CompactView(Protocol):
+    """A view that collects its splats, chunk by chunk, in row order."""
+
+    record: np.ndarray  # [32] f32, from `camera_record`
+    camera: Any  # The same record on the backend
+    count: int  # Splats that the view shows so far
+
+    def put(self, splats: Splats) -> bool:
+        """Append the splats of a chunk that the view shows; False if there is no room for them."""
+
+
+class ShownView:
+    """The current view, which collects its splats in its own buffers."""
+
+    def __init__(self, backend: Backend, buffers: ViewBuffers, record: np.ndarray) -> None:
+        self._backend, self._buffers = backend, buffers
+        self.record, self.camera = record, buffers.camera
+        self.count = 0
+        self._rows: list[np.ndarray] = []
+
+    def put(self, splats: Splats) -> bool:
+        """See `CompactView.put`."""
+        at, buffers = self.count, self._buffers
+        records, keys, bounds, rows = splats
+        assert buffers.rows is not None
+        self.count += len(rows)
+        if self.count > buffers.rows:
+            return False
+        self._backend.write(buffers.records, records, 16 * at)
+        self._backend.write(buffers.keys, keys, at)
+        self._backend.write(buffers.bounds, bounds, at)
+        self._rows.append(rows)
+        return True
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[count] u32, the splats' rows of the scene."""
+        return np.concatenate(self._rows) if self._rows else np.zeros(0, np.uint32)
+
+
+def fill_compact(
+    backend: Backend, scene: DeviceScene, buffers: ViewBuffers, views: Sequence[CompactView], inria_extent: int
+) -> int:
+    """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
+
+    Returns the row of the scene that was reached. It stops early if a view has no more room.
+    """
+
+    def wanted(bounds: ChunkBounds) -> bool:
+        return any(bounds.seen(view.record, bool(inria_extent)).any() for view in views)
+
+    out, blocks = buffers.chunk, buffers.blocks(-(-scene.compact_rows // ROW_BLOCK))
+    # Kept for all chunks: fresh pages for each one take longer than the copies.
+    on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(out[0].shape[0]).values()]
+    for chunk in scene.chunks(wanted):
+        for view in views:
+            seen = scene.blocks_seen(chunk, view.record, inria_extent)
+            part = ViewPart.of(chunk, seen, 0, 0, blocks)
+            backend.write(blocks, seen)
+            chunk.project(backend, view.camera, part, inria_extent, scene.antialiased, out)
+            records, keys, bounds = map(backend.read, out, (values[: part.count] for values in on_host))
+            shown = np.flatnonzero(keys != CULLED)
+            rows = part.rows.take(shown)
+            # `take` is much faster than `records[shown]`.
+            if not view.put((records.take(shown, axis=0), keys.take(shown), bounds.take(shown), rows)):
+                return chunk.base + chunk.count
+    return scene.count
+
 
 AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
 """Bytes that one waiting splat takes in the scratch file, its row number included."""
@@ -59,10 +134,7 @@ class WaitingView:
     def fill(self, buffers: ViewBuffers) -> np.ndarray:
         """Copy all splats into the buffers of a view, which must have room for them.
 
-        Returns
-        -------
-        np.ndarray
-            [count] u32, the splats' rows of the scene.
+        Returns [count] u32, the splats' rows of the scene.
         """
         self._wait()
         self._backend.mark()()  # the view before may still be drawn from these buffers
@@ -130,11 +202,8 @@ class ViewsAhead:
     ) -> tuple[int, int, np.ndarray | None]:
         """Put the splats that a view shows into its buffers.
 
-        Returns
-        -------
-        tuple
-            The number of splats, the row of the scene up to which they were counted, and their rows ([m] u32).
-            The rows are None if the buffers have no room.
+        Returns the number of splats, the row of the scene up to which they were counted, and their rows ([m] u32). The
+        rows are None if the buffers have no room.
         """
         assert buffers.rows is not None
         record = camera_record(camera, scene.origin, near)

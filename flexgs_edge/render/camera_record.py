@@ -12,19 +12,8 @@ from flexgs_edge.small_matrices import product
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
     """Compute the 32 floats that `project` reads, in float64, and round them once.
 
-    Parameters
-    ----------
-    camera : Camera
-        In world coordinates.
-    origin : np.ndarray
-        [3] f64, the world point that the scene is centred at.
-    near : float
-        Near plane, scene units.
-
-    Returns
-    -------
-    np.ndarray
-        [32] f32.
+    `camera`: in world coordinates. `origin`: [3] f64, the world point that the scene is centred at. `near`: near plane,
+    scene units. Returns [32] f32.
     """
     moved = camera.moved(origin)
     x_low = -(moved.cx + 0.5) / moved.fx - JACOBIAN_MARGIN * moved.width / moved.fx

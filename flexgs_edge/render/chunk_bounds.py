@@ -21,24 +21,20 @@ INRIA_SPREAD = math.sqrt(math.sqrt(0.1))
 ROUNDING = 1e-5
 """Bound of the float32 error in `project`, as a share of the largest term: generous, so that no block vanishes by
 rounding."""
-LARGER = 1.001
-"""Factor that widens the extent of a block against rounding."""
+LARGER = 1.001  # Factor that widens the extent of a block against rounding
 
 
 @dataclass(frozen=True)
 class ChunkBounds:
     """Bounds of the blocks of one chunk of a scene: ROW_BLOCK rows each, in row order.
 
-    Parameters
-    ----------
-    middle, half : np.ndarray
-        [3, blocks] f64, centre and half size of the box around the means, scene units relative to the origin.
-    extent : np.ndarray
-        [blocks] f64, largest standard deviation of any Gaussian along any of its own axes, scene units.
+    `middle`, `half`: [3, blocks] f64, centre and half size of the box around the means, scene units relative to the
+    origin.
     """
 
     middle: np.ndarray
     half: np.ndarray
+    # [blocks] f64, largest standard deviation of any Gaussian along any of its own axes, scene units.
     extent: np.ndarray
 
     @classmethod

@@ -10,12 +10,10 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.render.chunks import ChunkArrays, ChunkPlanes
 from flexgs_edge.render.fit import padded
 
-SLOTS = 2
-"""Chunks that memory always has room for: one is drawn while the next one loads."""
+SLOTS = 2  # Chunks that memory always has room for: one is drawn while the next one loads
 MOST_SLOTS = 3
 """Chunks if memory has room for one more: the disk then rests less between two. docs/results/tuning.md#most_slots"""
-Span = tuple[int, int, int]
-"""First row, row after the last, and SH degree of a chunk."""
+Span = tuple[int, int, int]  # First row, row after the last, and SH degree of a chunk
 
 
 @dataclass
@@ -30,23 +28,15 @@ class Loading:
 class ChunkLoads:
     """The chunks that one view asks for, in turn; close when done.
 
-    Parameters
-    ----------
-    backend : Backend
-    planes : ChunkPlanes
-        Fills the chunks.
-    may_stay : callable
-        Whether a chunk of so many rows may get arrays of its own, which outlive this object.
-    may_add : callable
-        Whether memory has room for one chunk of so many rows beyond `SLOTS`.
+    `may_stay`: whether a chunk of so many rows may get arrays of its own, which outlive this object.
     """
 
     def __init__(
         self,
         backend: Backend,
-        planes: ChunkPlanes,
+        planes: ChunkPlanes,  # fills the chunks
         may_stay: Callable[[int], bool],
-        may_add: Callable[[int], bool],
+        may_add: Callable[[int], bool],  # whether memory has room for one chunk of so many rows beyond `SLOTS`
     ) -> None:
         self._backend, self._planes, self._may_stay, self._may_add = backend, planes, may_stay, may_add
         self._loader = ThreadPoolExecutor(1, "load")

@@ -19,30 +19,14 @@ from flexgs_edge.scene.source import SceneSource
 
 @dataclass(frozen=True)
 class ViewPart:
-    """The rows of a chunk that a view may show: whole blocks, in row order, side by side in the arrays of the view.
+    """The rows of a chunk that a view may show: whole blocks, in row order, side by side in the arrays of the view."""
 
-    Parameters
-    ----------
-    chunk_base : int
-        The chunk's first row in the scene.
-    count : int
-        Rows of the part.
-    base : int
-        Its first row in the view's arrays.
-    first : int
-        Place of its first block in `blocks`.
-    blocks : array of the backend
-        [.] u32, blocks of this chunk and of others, by their numbers within their chunks.
-    seen : np.ndarray
-        [.] u32, the blocks of this part.
-    """
-
-    chunk_base: int
-    count: int
-    base: int
-    first: int
-    blocks: Any
-    seen: np.ndarray
+    chunk_base: int  # the chunk's first row in the scene
+    count: int  # rows of the part
+    base: int  # its first row in the view's arrays
+    first: int  # place of its first block in `blocks`
+    blocks: Any  # [.] u32, blocks of this chunk and of others, by their numbers within their chunks
+    seen: np.ndarray  # [.] u32, the blocks of this part
 
     @classmethod
     def of(cls, chunk: Chunk, seen: np.ndarray, base: int, first: int, blocks: Any) -> ViewPart:
@@ -136,19 +120,13 @@ class ChunkArrays:
 
 
 class ChunkPlanes(Protocol):
-    """Fills the chunks of a scene, the rows with SH first.
-
-    Attributes
-    ----------
-    bounds : dict of int to ChunkBounds
-        Bounds of chunks that are known so far, by their first rows.
-    """
+    """Fills the chunks of a scene, the rows with SH first."""
 
     count: int
     sh_count: int
     sh_degree: int
     origin: np.ndarray
-    bounds: dict[int, ChunkBounds]
+    bounds: dict[int, ChunkBounds]  # bounds of chunks that are known so far, by their first rows
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
         """Fill arrays of the backend with rows [start, stop), [width, padded(stop - start)] by field name."""
@@ -165,8 +143,7 @@ class SourcePlanes:
         self.source = source
         self.count, self.sh_count, self.sh_degree = source.count, source.sh_count, source.sh_degree
         self.origin = source.origin
-        self.bounds: dict[int, ChunkBounds] = {}
-        """Bounds of the chunks loaded so far, by their first rows."""
+        self.bounds: dict[int, ChunkBounds] = {}  # Bounds of the chunks loaded so far, by their first rows
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
         """Read rows [start, stop) into arrays of the backend, [width, padded(stop - start)] by field name."""

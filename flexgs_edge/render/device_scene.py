@@ -36,37 +36,21 @@ class DeviceScene:
     The first view decides, from the memory that it leaves free, whether the scene stays on the backend or is streamed.
     The result is the same.
 
-    Parameters
-    ----------
-    backend : Backend
-    planes : ChunkPlanes
-        Loads each chunk: once if the scene fits into the budget, else once a view.
-    budget : MemoryBudget
-    antialiased : bool
-        Draw with antialiasing; `cov` of the chunks then holds the factor of the covariance.
-    sum_bytes : int
-        Bytes a row that sums over views will take on the backend, to be left free.
-    references : bool
-        Views will be compared with targets on the backend; their room is taken with the view's buffers.
-    structure : bool
-        They will be compared by their structure, too (`Renderer.gradient_sums`).
-    view_sums : int
-        Most planes of sums that a view has.
-    fit : Fit, optional
-        How the scene shares memory with its views.
+    `antialiased`: draw with antialiasing; `cov` of the chunks then holds the factor of the covariance. `references`:
+    views will be compared with targets on the backend; their room is taken with the view's buffers.
     """
 
     def __init__(
         self,
         backend: Backend,
-        planes: ChunkPlanes,
+        planes: ChunkPlanes,  # loads each chunk: once if the scene fits into the budget, else once a view
         budget: MemoryBudget,
         antialiased: bool = False,
-        sum_bytes: int = SUM_BYTES,
+        sum_bytes: int = SUM_BYTES,  # bytes a row that sums over views will take on the backend, to be left free
         references: bool = False,
-        structure: bool = False,
-        view_sums: int = MOST_SUMS,
-        fit: Fit | None = None,
+        structure: bool = False,  # they will be compared by their structure, too (`Renderer.gradient_sums`)
+        view_sums: int = MOST_SUMS,  # most planes of sums that a view has
+        fit: Fit | None = None,  # how the scene shares memory with its views
     ) -> None:
         self.backend = backend
         self.count = planes.count
@@ -79,17 +63,13 @@ class DeviceScene:
         self.sum_bytes = sum_bytes
         self.view_sums = view_sums
         self.fit = fit or fit_module.DEFAULT
-        self.changes = 0
-        """How many times the values have changed."""
-        self.shown: int | None = None
-        """Rows that a compact view has room for; None while views have room for all rows."""
+        self.changes = 0  # How many times the values have changed
+        self.shown: int | None = None  # Rows that a compact view has room for; None while views have room for all rows
         self._planes = planes
         self._budget = budget
         self._resident: list[Chunk] = []
-        self._pinned: dict[int, Chunk] = {}
-        """Chunks of a compact scene that stay on the backend, by their first rows."""
-        self._drawn = -1
-        """First row of the chunk in use, -1 if none is; `give_way` must not free it."""
+        self._pinned: dict[int, Chunk] = {}  # Chunks of a compact scene that stay on the backend, by their first rows
+        self._drawn = -1  # First row of the chunk in use, -1 if none is; `give_way` must not free it
         self._stays = self._keeps_chunks = False
         self._rows = 0
         self._chunk_row_bytes = streamed_bytes(planes.sh_degree)
@@ -149,10 +129,7 @@ class DeviceScene:
 
         It covers the chunks on the backend. With `of_source`, or if the scene is streamed, it covers the stored values.
 
-        Returns
-        -------
-        bytes or None
-            None if nothing is on the backend and there is no source.
+        Returns none if nothing is on the backend and there is no source.
         """
         source = self.source
         if source is not None and (of_source or self._streamed):

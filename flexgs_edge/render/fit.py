@@ -14,25 +14,18 @@ import numpy as np
 from flexgs_edge.constants import LANES, ROW_BLOCK, SSIM_WINDOW, TILE
 from flexgs_edge.scene.fields import FIELD
 
-Shapes = dict[str, tuple[tuple[int, ...], Any]]
-"""Shape and type of each array, by name."""
+Shapes = dict[str, tuple[tuple[int, ...], Any]]  # Shape and type of each array, by name
 
 RAW_BYTES = 4 * (3 + 4 + 1)
 """Extra bytes a row while a chunk is loaded: stored scale, rotation and opacity, freed after `activate`."""
-GROWTH = 1.1
-"""Room beyond the estimate that the part of a view projected so far gives."""
-GUESS = 1.02
-"""Room beyond the largest share of rows that a view has shown so far."""
-MOST_SUMS = 6
-"""Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)."""
-GRADIENT_SUMS = 9
-"""Number of planes of `Renderer.gradient_sums`."""
+GROWTH = 1.1  # Room beyond the estimate that the part of a view projected so far gives
+GUESS = 1.02  # Room beyond the largest share of rows that a view has shown so far
+MOST_SUMS = 6  # Largest number of sum planes of a view (`Renderer.residual_and_removal_sums`)
+GRADIENT_SUMS = 9  # Number of planes of `Renderer.gradient_sums`
 SORT_DIGIT_BITS = 11
 SORT_DIGITS = 1 << SORT_DIGIT_BITS
-REFERENCE_BYTES = 6
-"""Bytes a pixel and channel of a target (f16) and of the residual against it (f32)."""
-PAIR_BYTES = 20
-"""Bytes of a pair in a tile list (8) and of its draft (12)."""
+REFERENCE_BYTES = 6  # Bytes a pixel and channel of a target (f16) and of the residual against it (f32)
+PAIR_BYTES = 20  # Bytes of a pair in a tile list (8) and of its draft (12)
 PAIR_SHARE = 8
 """The tile lists take at most this part (one in eight) of the free memory, so that the scene gets the rest."""
 COMPACT_PAIR_SHARE = 2
@@ -43,42 +36,21 @@ AHEAD_SHARE = 8
 
 @dataclass(frozen=True)
 class Fit:
-    """How a scene and its views share memory. Pictures and sums have the same bits with any values.
+    """How a scene and its views share memory. Pictures and sums have the same bits with any values."""
 
-    Parameters
-    ----------
-    chunk_rows : int
-        Most rows of a chunk: 60 MB of planes at SH degree 3, large enough to hide the cost of a launch.
-    least_rows : int
-        Rows of the smallest chunk of a streamed scene.
-    compact_rows : int
-        Rows of a chunk if views are compact: 33 MB, with all that projecting it takes.
-    pairs : int
-        Most pairs of a batch: 40 MiB, enough to draw most views in one batch.
-    capacity_step : int
-        Compact views make room for multiples of so many rows, so that views of about one size share their buffers.
-    first_share : int
-        A compact view first gets room for one in so many of the scene's rows.
-    spare_share : int
-        Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none
-        stays.
-    ahead : int
-        Views that are projected together with the current one.
-    resident : bool
-        Keep a scene that fits on the backend; if False, always stream it.
-    whole_views : bool
-        Give a view room for all rows of its scene if memory allows; if False, all views are compact.
-    """
-
+    # Most rows of a chunk: 60 MB of planes at SH degree 3, large enough to hide the cost of a launch.
     chunk_rows: int = 1 << 18
-    least_rows: int = 1 << 10
-    compact_rows: int = 1 << 16
-    pairs: int = 1 << 21
+    least_rows: int = 1 << 10  # rows of the smallest chunk of a streamed scene
+    compact_rows: int = 1 << 16  # rows of a chunk if views are compact: 33 MB, with all that projecting it takes
+    pairs: int = 1 << 21  # most pairs of a batch: 40 MiB, enough to draw most views in one batch
+    # Compact views make room for multiples of so many rows, so that views of about one size share their buffers.
     capacity_step: int = 1 << 16
-    first_share: int = 4
+    first_share: int = 4  # a compact view first gets room for one in so many of the scene's rows
+    # Chunks of a compact scene stay on the backend only if one in so many bytes of the limit is free. At 1, none stays.
     spare_share: int = 4
-    ahead: int = 3
-    resident: bool = True
+    ahead: int = 3  # views that are projected together with the current one
+    resident: bool = True  # keep a scene that fits on the backend; if False, always stream it
+    # Give a view room for all rows of its scene if memory allows; if False, all views are compact.
     whole_views: bool = True
 
     def capacity(self, count: int, share: float) -> int:
@@ -86,20 +58,15 @@ class Fit:
         return min((int(share * count) // self.capacity_step + 1) * self.capacity_step, count)
 
 
-DEFAULT = Fit()
-"""The fit of a `Renderer` that is given none."""
+DEFAULT = Fit()  # The fit of a `Renderer` that is given none
 
 
 @dataclass(frozen=True)
 class ViewSize:
     """The size of a view's buffers, apart from their rows.
 
-    Parameters
-    ----------
-    width, height : int
-        Pixels.
-    sort_blocks, tile_blocks : int
-        Work-items of the backend for the depth sort and for the tile lists.
+    `width`, `height`: pixels. `sort_blocks`, `tile_blocks`: work-items of the backend for the depth sort and for the
+    tile lists.
     """
 
     width: int
@@ -243,10 +210,7 @@ def reference_bytes(size: ViewSize) -> int:
 def structure_shapes(size: ViewSize) -> Shapes:
     """Buffers for the gradient of a view's SSIM. They end in rows that the sums of the last pixels read."""
     stride = size.tiles_x * TILE
-    return {
-        "taps": ((SSIM_WINDOW,), np.float32),
-        "slopes": ((3, 3, (size.height + SSIM_WINDOW) * stride), np.float32),
-    }
+    return {"taps": ((SSIM_WINDOW,), np.float32), "slopes": ((3, 3, (size.height + SSIM_WINDOW) * stride), np.float32)}
 
 
 def target_bytes(scene: SceneSize, size: ViewSize) -> int:

@@ -23,16 +23,7 @@ from flexgs_edge.render.ahead import ViewsAhead
 from flexgs_edge.render.camera_record import camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.fit import (
-    GRADIENT_SUMS,
-    GROWTH,
-    GUESS,
-    MOST_SUMS,
-    SUM_BYTES,
-    Fit,
-    fits_whole,
-    saves_bytes,
-)
+from flexgs_edge.render.fit import GRADIENT_SUMS, GROWTH, GUESS, MOST_SUMS, SUM_BYTES, Fit, fits_whole, saves_bytes
 from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
 from flexgs_edge.render.tile_lists import list_tiles, sort_splats, split_batches
@@ -49,50 +40,29 @@ class _View:
     buffers: ViewBuffers
     camera: Camera
     batches: list[tuple[int, int]]
-    count: int
-    """Rows of the view's sums."""
-    parts: dict[int, ViewPart] | None
-    """The rows of each chunk, by the chunk's first row; None in a compact view."""
+    count: int  # Rows of the view's sums
+    parts: dict[int, ViewPart] | None  # The rows of each chunk, by the chunk's first row; None in a compact view
 
 
 class Renderer:
     """Renders views and sums what each Gaussian contributes, on a backend.
 
-    Parameters
-    ----------
-    backend : Backend
-        From `flexgs_edge.kernels.open_backend`.
-    budget : MemoryBudget
-    near : float
-        Near plane, scene units.
-    background : sequence of float
-        Red, green, blue in [0, 1]; black by default.
-    extent : {"exact", "inria"}
-        Pixels that a splat may reach: the ellipse of alpha >= 1/255 (default), or the tiles of ceil(3 sigma) that the
-        reference rasteriser uses.
-    antialiased : bool
-        Multiply opacities by sqrt(det before / det after) of the 2D covariance's dilation. Set it if the model was
-        trained so.
-    fit : Fit, optional
-        How scenes and views share memory.
-
-    Attributes
-    ----------
-    storage : Storage
-        Takes the sums over views if memory cannot hold them beside a view.
-    largest : Camera or None
-        The largest view to come, if it is known. Its size decides whether views have room for all rows.
+    `extent` ({"exact", "inria"}): pixels that a splat may reach: the ellipse of alpha >= 1/255 (default), or the tiles
+    of ceil(3 sigma) that the reference rasteriser uses. `antialiased`: multiply opacities by sqrt(det before / det
+    after) of the 2D covariance's dilation. Set it if the model was trained so. `storage`: takes the sums over views if
+    memory cannot hold them beside a view. `largest`: the largest view to come, if it is known. Its size decides whether
+    views have room for all rows.
     """
 
     def __init__(
         self,
-        backend: Backend,
+        backend: Backend,  # from `flexgs_edge.kernels.open_backend`
         budget: MemoryBudget,
-        near: float = DEFAULT_NEAR,
-        background: Sequence[float] = (0.0, 0.0, 0.0),
+        near: float = DEFAULT_NEAR,  # near plane, scene units
+        background: Sequence[float] = (0.0, 0.0, 0.0),  # red, green, blue in [0, 1]; black by default
         extent: str = "exact",
         antialiased: bool = False,
-        fit: Fit | None = None,
+        fit: Fit | None = None,  # how scenes and views share memory
     ) -> None:
         if extent not in EXTENTS:
             raise InputError(f"extent {extent!r}: expected one of {', '.join(EXTENTS)}")
@@ -108,8 +78,7 @@ class Renderer:
         self.splats_shown = 0
         self._shown_rows: np.ndarray | None = None
         """[m] u32, the rows of the scene that the last view shows, if it was compact."""
-        self._share = 0.0
-        """Largest share of its rows that a scene has shown in a compact view so far."""
+        self._share = 0.0  # Largest share of its rows that a scene has shown in a compact view so far
         self._ahead = ViewsAhead(backend, self.fit.ahead)
         self._buffers: ViewBuffers | None = None
         self._drawn: _View | None = None
@@ -155,25 +124,12 @@ class Renderer:
     def load(
         self,
         source: SceneSource,
-        sum_bytes: int = SUM_BYTES,
-        references: bool = False,
-        structure: bool = False,
-        view_sums: int = MOST_SUMS,
+        sum_bytes: int = SUM_BYTES,  # bytes a row to leave free for sums over views
+        references: bool = False,  # leave room to compare views with targets
+        structure: bool = False,  # leave room for the structural term of `gradient_sums`
+        view_sums: int = MOST_SUMS,  # most planes of sums that a view has
     ) -> DeviceScene:
-        """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit.
-
-        Parameters
-        ----------
-        source : SceneSource
-        sum_bytes : int
-            Bytes a row to leave free for sums over views.
-        references : bool
-            Leave room to compare views with targets.
-        structure : bool
-            Leave room for the structural term of `gradient_sums`.
-        view_sums : int
-            Most planes of sums that a view has.
-        """
+        """Bring a scene to the backend: all of it, or chunk by chunk for each view if it does not fit."""
         self.release()
         planes = SourcePlanes(self.backend, source)
         return DeviceScene(
@@ -189,10 +145,7 @@ class Renderer:
     def render(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
         """Draw `scene` from `camera` (world coordinates).
 
-        Returns
-        -------
-        np.ndarray
-            [H, W, 3] f32 in the model's own colour space, not clamped.
+        Returns [H, W, 3] f32 in the model's own colour space, not clamped.
         """
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
@@ -236,11 +189,8 @@ class Renderer:
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.
 
-        Returns
-        -------
-        array of the backend
-            [m, 2, 2] u32 for the rows of `parts` or `view_rows`, low and high words in units of 1 / `FIXED_ERROR`; valid
-            until the next sums are drawn.
+        Returns [m, 2, 2] u32 for the rows of `parts` or `view_rows`, low and high words in units of 1 / `FIXED_ERROR`;
+        valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -253,11 +203,8 @@ class Renderer:
 
         `target`: [3, H, W] f16, in the layout of `render_planes`.
 
-        Returns
-        -------
-        array of the backend
-            [m, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of
-            1 / `FIXED_WEIGHT`; valid until the next sums are drawn.
+        Returns [m, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of 1
+        / `FIXED_WEIGHT`; valid until the next sums are drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -270,11 +217,8 @@ class Renderer:
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """The sums of `residual_sums` and `removal_sums` in one view, cheaper than two calls.
 
-        Returns
-        -------
-        array of the backend
-            [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
-            drawn.
+        Returns [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
+        drawn.
         """
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
@@ -291,11 +235,8 @@ class Renderer:
         adds when its alpha grows by its own size. The sums are sum(alpha T r) for red, green, blue, then sum(r e), then
         its moments about the splat's centre: x, y, xx, xy, yy.
 
-        Returns
-        -------
-        array of the backend
-            [N, 9, 2] u32 for all rows, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1 /
-            `FIXED_MOMENT`; valid until the next sums are drawn.
+        Returns [N, 9, 2] u32 for all rows, low and high words in units of 1 / `FIXED_WEIGHT`, the moments in units of 1
+        / `FIXED_MOMENT`; valid until the next sums are drawn.
         """
         # A descent moves means and scales, so the bounds of the blocks say nothing here.
         view = self._prepare(scene, camera, whole=True)

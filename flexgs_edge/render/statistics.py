@@ -11,26 +11,18 @@ import numpy as np
 from flexgs_edge.constants import FIXED_WEIGHT, SUM_LANES
 from flexgs_edge.kernels.backend import Backend
 
-SUM_ROWS = 1 << 18
-"""Rows of sums that are copied to the host at a time."""
+SUM_ROWS = 1 << 18  # Rows of sums that are copied to the host at a time
 GROUP_ROWS = 1 << 12
 """Rows of sums over views that are copied at a time, a multiple of `SUM_LANES`: few enough for a core's cache."""
 
 
 @dataclass
 class Statistics:
-    """Sums over the views added so far, one entry for each row of the scene.
+    """Sums over the views added so far, one entry for each row of the scene."""
 
-    Attributes
-    ----------
-    hits : np.ndarray
-        [N] i64, pixels that the Gaussian was blended into.
-    weights : np.ndarray
-        [N] u64, sum of alpha T over pixels, in fixed point with units of 1 / `FIXED_WEIGHT`. Integers add exactly, so
-        any order of views, chunks and workers gives the same bits.
-    """
-
-    hits: np.ndarray
+    hits: np.ndarray  # [N] i64, pixels that the Gaussian was blended into
+    # [N] u64, sum of alpha T over pixels, in fixed point with units of 1 / `FIXED_WEIGHT`. Integers add exactly, so any
+    # order of views, chunks and workers gives the same bits.
     weights: np.ndarray
 
     @classmethod
@@ -47,18 +39,8 @@ class Statistics:
 def planes_of(backend: Backend, sums: Any, count: int) -> Iterator[tuple[slice, np.ndarray]]:
     """Read sums over views, which lie in groups, part by part.
 
-    Parameters
-    ----------
-    sums : array of the backend
-        [groups, ..., SUM_LANES], sums of a group of rows for each plane.
-    count : int
-        How many rows to read.
-
-    Yields
-    ------
-    rows : slice
-    planes : np.ndarray
-        [planes, rows], valid until the next step.
+    `sums`: [groups, ..., SUM_LANES], sums of a group of rows for each plane. `count`: how many rows to read. Yields
+    `rows`: rows : slice. `planes`: [planes, rows], valid until the next step.
     """
     planes = int(np.prod(sums.shape[1:-1]))
     lanes = np.dtype((np.void, SUM_LANES * np.dtype(sums.dtype).itemsize))

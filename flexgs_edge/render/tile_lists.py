@@ -11,10 +11,8 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.render.fit import SORT_DIGIT_BITS, SORT_DIGITS
 from flexgs_edge.render.view_buffers import ViewBuffers
 
-PIECES = 8
-"""A batch has at least so many pieces, so that at most one part in so many of its room stays empty."""
-MOST_COUNTED = 2**32 - 1
-"""Most pairs that the device counts in one block."""
+PIECES = 8  # A batch has at least so many pieces, so that at most one part in so many of its room stays empty
+MOST_COUNTED = 2**32 - 1  # Most pairs that the device counts in one block
 
 
 def sort_splats(backend: Backend, buffers: ViewBuffers, count: int) -> tuple[int, int]:

@@ -22,8 +22,7 @@ from flexgs_edge.render.fit import (
     view_shapes,
 )
 
-TILES_AT_ONCE = 1024
-"""Tiles whose state is copied to the host at a time."""
+TILES_AT_ONCE = 1024  # Tiles whose state is copied to the host at a time
 
 
 def view_size(backend: Backend, camera: Camera) -> ViewSize:
@@ -55,8 +54,7 @@ class ViewBuffers:
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
         self._structure: tuple[Any, Any] | None = None
-        self._window = 0
-        """Side of the window that the taps and the zeros around the slopes are for; 0: none yet."""
+        self._window = 0  # Side of the window that the taps and the zeros around the slopes are for; 0: none yet
         shapes = view_shapes(self.size, count)
         size = shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the

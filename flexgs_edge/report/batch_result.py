@@ -15,24 +15,12 @@ _HEADINGS = ("input", "output", "as .ply", "file", "ratio", "quality", "time")
 
 @dataclass(frozen=True)
 class BatchItem:
-    """One scene of several.
+    """One scene of several."""
 
-    Parameters
-    ----------
-    input : str
-        The scene, as given or as found in a folder.
-    result : CompressResult or None
-        `None` if the scene failed.
-    error : str or None
-        Why it failed.
-    exit_code : int
-        What `compress` of this scene alone would have ended with.
-    """
-
-    input: str
-    result: CompressResult | None
-    error: str | None = None
-    exit_code: int = 0
+    input: str  # the scene, as given or as found in a folder
+    result: CompressResult | None  # `None` if the scene failed
+    error: str | None = None  # why it failed
+    exit_code: int = 0  # what `compress` of this scene alone would have ended with
 
     @property
     def reason(self) -> str:
@@ -48,21 +36,11 @@ class BatchItem:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Result of `compress_all`.
+    """Result of `compress_all`."""
 
-    Parameters
-    ----------
-    items : tuple of BatchItem
-        The scenes that are done or failed, in the order of the inputs.
-    total : int
-        Number of scenes. An interruption leaves more of them than `items`.
-    seconds : float
-        Wall seconds of all.
-    """
-
-    items: tuple[BatchItem, ...]
-    total: int
-    seconds: float
+    items: tuple[BatchItem, ...]  # the scenes that are done or failed, in the order of the inputs
+    total: int  # Number of scenes. An interruption leaves more of them than `items`.
+    seconds: float  # wall seconds of all
 
     @property
     def results(self) -> tuple[CompressResult, ...]:

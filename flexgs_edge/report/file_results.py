@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.codec.header import Section
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import line, run_lines, scene_lines, text, view_lines
 from flexgs_edge.units import format_mib, format_size, times_words
 
@@ -81,18 +80,7 @@ class DecompressResult:
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
         ratio = self.scene.ratio_of(self.size)
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "decompress",
-            "input": self.scene.to_json(),
-            "output": self.output,
-            "size": self.size,
-            "ratio_of_input": None if ratio is None else round(ratio, 4),
-            "notes": list(self.notes),
-            "loss": None if self.loss is None else asdict(self.loss),
-            "warnings": list(self.warnings),
-            "run": self.run.to_json(),
-        }
+        return record("decompress", self, ratio_of_input=None if ratio is None else round(ratio, 4))
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -128,19 +116,17 @@ class RenderResult:
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
         run = self.run.to_json()
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "render",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "files": list(self.files),
-            "ms_per_view": round(self.ms_per_view, 3),
-            "view_ms": [round(1000 * seconds, 3) for seconds in self.view_seconds],
-            "startup_ms": run["startup_ms"],
-            "compile_ms": run["compile_ms"],
-            "warm_up_ms": round(1000 * self.warm_up_seconds, 1),
-            "run": run,
-        }
+        return record(
+            "render",
+            self,
+            "view_seconds",
+            "warm_up_seconds",
+            ms_per_view=round(self.ms_per_view, 3),
+            view_ms=[round(1000 * seconds, 3) for seconds in self.view_seconds],
+            startup_ms=run["startup_ms"],
+            compile_ms=run["compile_ms"],
+            warm_up_ms=round(1000 * self.warm_up_seconds, 1),
+        )
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -172,17 +158,7 @@ class ScoreResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "score",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "output": self.output,
-            "score": self.score,
-            "scored_views": self.scored_views,
-            "unseen": self.unseen,
-            "run": self.run.to_json(),
-        }
+        return record("score", self)
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -195,18 +171,10 @@ class ScoreResult:
 
 @dataclass(frozen=True)
 class VerifyResult:
-    """Result of `verify`: the parts of a file and their verdicts.
+    """Result of `verify`: the parts of a file and their verdicts."""
 
-    Parameters
-    ----------
-    path : str
-        The file.
-    sections : tuple of Section
-        Name, offset, bytes and verdict of each part, in the order of the file.
-    """
-
-    path: str
-    sections: tuple[Section, ...]
+    path: str  # the file
+    sections: tuple[Section, ...]  # name, offset, bytes and verdict of each part, in the order of the file
 
     @property
     def ok(self) -> bool:
@@ -220,13 +188,7 @@ class VerifyResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "verify",
-            "path": self.path,
-            "ok": self.ok,
-            "sections": [asdict(section) for section in self.sections],
-        }
+        return record("verify", self, ok=self.ok)
 
     def summary(self) -> str:
         """Return the text that the command prints: one line per part."""
@@ -254,7 +216,7 @@ class TrimResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {"program": f"flexgs-edge {__version__}", "command": "trim", **asdict(self)}
+        return record("trim", self)
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -273,35 +235,18 @@ class TrimResult:
 class ViewResult:
     """Result of `view`: the scene that was shown, and where.
 
-    Parameters
-    ----------
-    scene : SceneInfo
-        The input.
-    size, views : int
-        Bytes of the `.fgs` that was shown, and cameras to choose from.
-    place : str
-        The page that was written, or the address that was served.
-    page_size : int or None
-        Bytes of the page that was written.
+    `size`, `views`: bytes of the `.fgs` that was shown, and cameras to choose from.
     """
 
-    scene: SceneInfo
+    scene: SceneInfo  # the input
     size: int
     views: int
-    place: str
-    page_size: int | None
+    place: str  # the page that was written, or the address that was served
+    page_size: int | None  # bytes of the page that was written
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "view",
-            "input": self.scene.to_json(),
-            "size": self.size,
-            "views": self.views,
-            "output" if self.page_size is not None else "address": self.place,
-            "page_size": self.page_size,
-        }
+        return record("view", self, "place", **{"output" if self.page_size is not None else "address": self.place})
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -316,21 +261,11 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class DevicesResult:
-    """Result of `devices`: the OpenCL devices, and the chosen one.
+    """Result of `devices`: the OpenCL devices, and the chosen one."""
 
-    Parameters
-    ----------
-    devices : tuple of DeviceInfo
-        Limits and self-test verdict of each device.
-    chosen : int or None
-        Index of the chosen device; `None` if no device works, or not the one asked for.
-    reason : str
-        Why this device was chosen, or why none was.
-    """
-
-    devices: tuple[DeviceInfo, ...]
-    chosen: int | None
-    reason: str
+    devices: tuple[DeviceInfo, ...]  # limits and self-test verdict of each device
+    chosen: int | None  # index of the chosen device; `None` if no device works, or not the one asked for
+    reason: str  # why this device was chosen, or why none was
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""

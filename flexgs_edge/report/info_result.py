@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flexgs_edge._version import __version__
+from flexgs_edge.report.run_info import record
 from flexgs_edge.units import format_size
 
 
@@ -14,70 +14,35 @@ from flexgs_edge.units import format_size
 class InfoResult:
     """Contents of a scene file.
 
-    Parameters
-    ----------
-    path : str
-        The file; for a model folder, its latest scene.
-    format : str
-        `fgs`, `ply`, `spz`, `sog`, `compressed.ply`, ...: by the file's first bytes, if they tell.
-    size : int
-        Bytes of the file, or of all files that are read.
-    count, sh_count, sh_degree : int
-        Gaussians, those that may have SH above degree 0, and the SH degree.
-    origin : tuple of float
-        Offset that the file subtracts from the positions, world coordinates.
-    source_ply_bytes : int or None
-        Bytes of the scene as a PLY; for a `.fgs`, of the original if the file states it.
-    notes : tuple of str
-        Values that the reader left out or changed.
-    version : int or None
-        Version of the `.fgs` format. Other formats have `None` here, and leave all fields up to `cut_from` empty.
-    channels : dict
-        Rows, precision and bytes of every channel, by its name.
-    settings : dict
-        How the file was made.
-    chroma : float or None
-        Step size of chroma, relative to that of luma (version 2).
-    model_bytes : int or None
-        Bytes of the coder's tables (version 2).
-    layers : tuple of dict or None
-        Rows and bytes of every layer (version 2).
-    preview : dict or None
-        Rows and bytes of the preview (version 2); None if there is none.
-    cut_from : dict or None
-        Size and rows of the file before `trim` (version 2).
-    cameras, images : str or None
-        Cameras and photos beside a file of another format.
-    antialiased : bool or None
-        Whether a file of another format, or its model folder, asks for antialiased drawing; `None`: neither says so.
-    format_version : int or None
-        Version of another format, if the file states one.
-    frame : str or None
-        Directions of the axes in a file of another format, such as `RUB`; it is read into RDF.
+    `count`, `sh_count`, `sh_degree`: Gaussians, those that may have SH above degree 0, and the SH degree. `cameras`,
+    `images`: cameras and photos beside a file of another format.
     """
 
-    path: str
-    format: str
-    size: int
+    path: str  # the file; for a model folder, its latest scene
+    format: str  # `fgs`, `ply`, `spz`, `sog`, `compressed.ply`, ...: by the file's first bytes, if they tell
+    size: int  # bytes of the file, or of all files that are read
     count: int
     sh_count: int
     sh_degree: int
-    origin: tuple[float, ...]
-    source_ply_bytes: int | None
-    notes: tuple[str, ...] = ()
+    origin: tuple[float, ...]  # offset that the file subtracts from the positions, world coordinates
+    source_ply_bytes: int | None  # bytes of the scene as a PLY; for a `.fgs`, of the original if the file states it
+    notes: tuple[str, ...] = ()  # values that the reader left out or changed
+    # Version of the `.fgs` format. Other formats have `None` here, and leave all fields up to `cut_from` empty.
     version: int | None = None
+    # Rows, precision and bytes of every channel, by its name.
     channels: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    chroma: float | None = None
-    model_bytes: int | None = None
-    layers: tuple[Mapping[str, int], ...] | None = None
-    preview: Mapping[str, int] | None = None
-    cut_from: Mapping[str, int] | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)  # how the file was made
+    chroma: float | None = None  # step size of chroma, relative to that of luma (version 2)
+    model_bytes: int | None = None  # bytes of the coder's tables (version 2)
+    layers: tuple[Mapping[str, int], ...] | None = None  # rows and bytes of every layer (version 2)
+    preview: Mapping[str, int] | None = None  # rows and bytes of the preview (version 2); None if there is none
+    cut_from: Mapping[str, int] | None = None  # size and rows of the file before `trim` (version 2)
     cameras: str | None = None
     images: str | None = None
+    # Whether a file of another format, or its model folder, asks for antialiased drawing; `None`: neither says so.
     antialiased: bool | None = None
-    format_version: int | None = None
-    frame: str | None = None
+    format_version: int | None = None  # version of another format, if the file states one
+    frame: str | None = None  # directions of the axes in a file of another format, such as `RUB`; it is read into RDF
 
     @property
     def ratio(self) -> float | None:
@@ -97,46 +62,13 @@ class InfoResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        record: dict[str, Any] = {
-            "program": f"flexgs-edge {__version__}",
-            "command": "info",
-            "path": self.path,
-            "format": self.format,
-            **({} if self.version is None else {"version": self.version}),
-            "size": self.size,
-            "count": self.count,
-            "sh_count": self.sh_count,
-            "sh_degree": self.sh_degree,
-            "origin": list(self.origin),
-        }
+        of_other = ("cameras", "images", "antialiased", "format_version", "frame")
+        of_version_2 = ("chroma", "model_bytes", "layers", "preview", "cut_from")
         if self.version is None:
-            return record | {
-                "source_ply_bytes": self.source_ply_bytes,
-                "cameras": self.cameras,
-                "images": self.images,
-                "antialiased": self.antialiased,
-                "format_version": self.format_version,
-                "frame": self.frame,
-                "notes": list(self.notes),
-            }
-        record |= {
-            "bits_per_gaussian": self.bits_per_gaussian,
-            "source_ply_bytes": self.source_ply_bytes,
-            "ratio": self.ratio,
-            "channels": {name: dict(channel) for name, channel in self.channels.items()},
-            "overhead_bytes": self.overhead_bytes,
-            "settings": dict(self.settings),
-            "notes": list(self.notes),
-        }
-        if self.layers is not None:
-            record |= {
-                "chroma": self.chroma,
-                "model_bytes": self.model_bytes,
-                "layers": [dict(layer) for layer in self.layers],
-                "preview": None if self.preview is None else dict(self.preview),
-                "cut_from": None if self.cut_from is None else dict(self.cut_from),
-            }
-        return record
+            return record("info", self, "version", "channels", "settings", *of_version_2)
+        left_out = of_other if self.layers is not None else (*of_other, *of_version_2)
+        derived = {name: getattr(self, name) for name in ("bits_per_gaussian", "ratio", "overhead_bytes")}
+        return record("info", self, *left_out, **derived)
 
     def summary(self) -> str:
         """Return the text that the command prints."""

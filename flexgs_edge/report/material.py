@@ -14,26 +14,13 @@ from flexgs_edge.goals.target import Target
 class Shot:
     """Pictures of one view, JPEG.
 
-    Parameters
-    ----------
-    view : int
-        Index into the views of the record's quality.
-    camera : int
-        Index into the cameras of the rig.
-    rank, of : int
-        Rank among the measured views, 0 for the worst, and the number of measured views.
-    width, height : int
-        Pixels of the pictures. Wider views were scaled down.
-    original, compressed, error : bytes
-        Render of the original, render of the decoded file, and the error map between them.
-    flip : bytes
-        Map of FLIP between both renders.
-    photo : bytes or None
-        The photo of this view, if there is one.
+    `rank`, `of`: rank among the measured views, 0 for the worst, and the number of measured views. `width`, `height`:
+    pixels of the pictures. Wider views were scaled down. `original`, `compressed`, `error`: render of the original,
+    render of the decoded file, and the error map between them.
     """
 
-    view: int
-    camera: int
+    view: int  # index into the views of the record's quality
+    camera: int  # index into the cameras of the rig
     rank: int
     of: int
     width: int
@@ -41,8 +28,8 @@ class Shot:
     original: bytes
     compressed: bytes
     error: bytes
-    flip: bytes
-    photo: bytes | None = None
+    flip: bytes  # map of FLIP between both renders
+    photo: bytes | None = None  # the photo of this view, if there is one
 
     @property
     def place(self) -> str:
@@ -59,77 +46,33 @@ class Shot:
 
 @dataclass(frozen=True)
 class Rig:
-    """Camera poses in order of name, and some points of the scene.
+    """Camera poses in order of name, and some points of the scene."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the V cameras.
-    centers : np.ndarray
-        [V, 3] f64, positions in world coordinates.
-    rotations : np.ndarray
-        [V, 3, 3] f64, world to camera (x right, y down, z forward).
-    reach : np.ndarray
-        [V, 2] f64, half the width and height of the visible area at distance 1.
-    held_out : frozenset of int
-        Indices of the held-out cameras. All others are training cameras.
-    points : np.ndarray
-        [P, 3] f64, positions of some Gaussians in world coordinates.
-    """
-
-    names: tuple[str, ...]
-    centers: np.ndarray
-    rotations: np.ndarray
-    reach: np.ndarray
-    held_out: frozenset[int]
-    points: np.ndarray
+    names: tuple[str, ...]  # names of the V cameras
+    centers: np.ndarray  # [V, 3] f64, positions in world coordinates
+    rotations: np.ndarray  # [V, 3, 3] f64, world to camera (x right, y down, z forward)
+    reach: np.ndarray  # [V, 2] f64, half the width and height of the visible area at distance 1
+    held_out: frozenset[int]  # Indices of the held-out cameras. All others are training cameras.
+    points: np.ndarray  # [P, 3] f64, positions of some Gaussians in world coordinates
 
 
 @dataclass(frozen=True)
 class Live:
-    """Scenes that a page draws while it is looked at.
+    """Scenes that a page draws while it is looked at."""
 
-    Parameters
-    ----------
-    script : str
-        Draws them.
-    config : dict
-        Cameras, the first of them, and how the scenes are drawn.
-    compressed : bytes or None
-        The `.fgs` that was made; `None` if it is too large.
-    original : bytes or None
-        The original as a `.fgs`.
-    note : str
-        Why a scene is not there.
-    """
-
-    script: str
-    config: dict[str, Any]
-    compressed: bytes | None
-    original: bytes | None
-    note: str
+    script: str  # draws them
+    config: dict[str, Any]  # cameras, the first of them, and how the scenes are drawn
+    compressed: bytes | None  # the `.fgs` that was made; `None` if it is too large
+    original: bytes | None  # the original as a `.fgs`
+    note: str  # why a scene is not there
 
 
 @dataclass(frozen=True)
 class Material:
-    """Contents of a page besides the result.
+    """Contents of a page besides the result."""
 
-    Parameters
-    ----------
-    shots : tuple of Shot
-        Pictures, worst view first.
-    rig : Rig or None
-        Camera poses; `None` without cameras.
-    contents : dict or None
-        JSON record of `info`; `None` for formats whose channels it does not know.
-    target : Target or None
-        Target that the search chart marks with a line.
-    live : Live or None
-        Live scenes.
-    """
-
-    shots: tuple[Shot, ...] = ()
-    rig: Rig | None = None
-    contents: dict[str, Any] | None = None
-    target: Target | None = None
-    live: Live | None = None
+    shots: tuple[Shot, ...] = ()  # pictures, worst view first
+    rig: Rig | None = None  # camera poses; `None` without cameras
+    contents: dict[str, Any] | None = None  # JSON record of `info`; `None` for formats whose channels it does not know
+    target: Target | None = None  # target that the search chart marks with a line
+    live: Live | None = None  # live scenes

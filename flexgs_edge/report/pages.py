@@ -2,24 +2,218 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
+import numpy as np
+
 from flexgs_edge.constants import FLIP_DEGREE
+from flexgs_edge.goals.steps import Step
+from flexgs_edge.goals.target import Target
 from flexgs_edge.quality.view_quality import Quality
-from flexgs_edge.report.camera_plan import plans
 from flexgs_edge.report.html import count, figure, render
-from flexgs_edge.report.material import Material
+from flexgs_edge.report.material import Material, Rig
 from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_words
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
-from flexgs_edge.report.search_chart import step_chart
 from flexgs_edge.report.summary import device_words, memory_words
 from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, css_ramp
 from flexgs_edge.units import format_size, times_words
 
-FEW_ROWS = 16
-"""With more steps than this, their table is folded up. With more views, their table scrolls."""
+SIDE = 360  # Width of a plan in its own units: as wide as a phone, like the charts
+WEDGE = 0.055  # Length of a camera's viewing wedge, as a share of the plan's width
+ROOM = 0.06  # Empty margin, as a share of the plan's width
+FAR = 0.35
+"""The scene's points widen the plan by at most this share of the cameras' extent. Some scenes reach to the horizon."""
+MOST_NAMES = 400
+"""With more cameras than this, plans leave out the names that a pointer would show, so that pages stay small."""
+
+
+def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
+    """Draw both plans and their key."""
+    across, away, up = axes(rig)
+    low, high = extent(rig, np.stack([across, away, up]))
+    # Both plans use one scale, so that they can be compared.
+    scale = SIDE * (1 - 2 * ROOM) / max(float((high - low)[:2].max()), 1e-12)
+    return render(
+        "plans.html",
+        plans=[
+            _plan("seen from above", rig, (across, away), (low[[0, 1]], high[[0, 1]]), scale, 0),
+            _plan("seen from the side", rig, (across, up), (low[[0, 2]], high[[0, 2]]), scale, 1),
+        ],
+        width=SIDE,
+        numbers=numbers,
+        named=len(rig.names) <= MOST_NAMES,
+        training=len(rig.names) - len(rig.held_out),
+        held_out=len(rig.held_out),
+        points=len(rig.points),
+    )
+
+
+def axes(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors [3] of the plan's axes in the world: across, away and up.
+
+    Away points from the viewer of the side plan into the scene. Up is the mean up direction of the cameras. If those cancel
+    out, up is the direction in which camera positions vary least.
+    """
+    centred = rig.centers - rig.centers.mean(axis=0)
+    up = -rig.rotations[:, 1, :].mean(axis=0)
+    if np.linalg.norm(up) < 0.1:
+        up = np.linalg.svd(centred, full_matrices=True)[2][2]
+    up = up / np.linalg.norm(up)
+    flat = centred - np.outer(centred @ up, up)
+    across = np.linalg.svd(flat, full_matrices=True)[2][0]
+    across = across - (across @ up) * up
+    if np.linalg.norm(flat) < 1e-9 or np.linalg.norm(across) < 1e-6:
+        # All cameras stand in one place: use right or forward of the first camera, whichever is less parallel to up.
+        right, forward = rig.rotations[0, 0], rig.rotations[0, 2]
+        across = max((axis - (axis @ up) * up for axis in (right, forward)), key=lambda axis: float(axis @ axis))
+    across = across / np.linalg.norm(across)
+    if across[np.argmax(np.abs(across))] < 0:
+        across = -across
+    return across, np.cross(up, across), up
+
+
+def extent(rig: Rig, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends [3] of the plan along the rows of `basis`: all cameras, and the middle of the scene as far as `FAR` allows."""
+    places = rig.centers @ basis.T
+    low, high = places.min(axis=0), places.max(axis=0)
+    if len(rig.points):
+        inner = np.percentile(rig.points @ basis.T, (5, 95), axis=0)
+        size = float((high - low).max())
+        reach = FAR * size if size > 0 else np.inf
+        low = np.minimum(low, np.maximum(inner[0], low - reach))
+        high = np.maximum(high, np.minimum(inner[1], high + reach))
+    # A single camera without a scene has no extent: add a margin.
+    if float((high - low).max()) == 0.0:
+        low, high = low - 1.0, high + 1.0
+    return low, high
+
+
+def _plan(
+    title: str,
+    rig: Rig,
+    basis: tuple[np.ndarray, np.ndarray],
+    ends: tuple[np.ndarray, np.ndarray],
+    scale: float,
+    half: int,
+) -> dict[str, Any]:
+    """Compute the positions of one plan. `half` chooses the half angle of the wedges: 0 of the width, 1 of the height."""
+    rows = np.stack(basis)
+    low, high = ends
+    rim = ROOM * SIDE
+    size = float(scale * (high - low)[1])
+    height = min(max(size + 2 * rim, SIDE / 4), SIDE)
+    # Centre the plan: the extent does not fill its shorter side.
+    offset = np.array([(SIDE - scale * (high - low)[0]) / 2, (height - size) / 2])
+
+    def at(points: np.ndarray) -> np.ndarray:
+        flat: np.ndarray = (points @ rows.T - low) * scale + offset
+        flat[:, 1] = height - flat[:, 1]
+        return flat
+
+    length = WEDGE * SIDE / scale
+    forward, side = rig.rotations[:, 2, :], rig.rotations[:, half, :]
+    reach = np.minimum(rig.reach[:, half], 1.5)[:, None]
+    feet = at(rig.centers)
+    left, right = (at(rig.centers + length * (forward + sign * reach * side)) for sign in (-1, 1))
+    # Draw the held-out cameras last: they are few and must stay visible.
+    order = sorted(range(len(rig.names)), key=lambda i: (i in rig.held_out, i))
+    return {
+        "title": title,
+        "height": height,
+        "dots": _dots(at(rig.points), height) if len(rig.points) else [],
+        "stands": [
+            {
+                "name": rig.names[i],
+                "held_out": i in rig.held_out,
+                "foot": tuple(feet[i]),
+                "left": tuple(left[i]),
+                "right": tuple(right[i]),
+                "label": np.clip(feet[i] + (5, -5), (2, 12), (SIDE - 12, height - 4)),
+            }
+            for i in order
+        ],
+    }
+
+
+def _dots(points: np.ndarray, height: float) -> list[tuple[int, int]]:
+    """Round points to whole positions within the plan, each once."""
+    inside = points[((points >= 0) & (points <= (SIDE, height))).all(axis=1)]
+    return list(dict.fromkeys((round(x), round(y)) for x, y in inside))
+
+
+# As wide as a phone, so that text stays readable there. On larger screens the chart and its text grow together.
+WIDTH, HEIGHT = 360, 230
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44, WIDTH - 12, 14, HEIGHT - 38
+
+
+def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
+    """Draw file size against the deciding figure, with one mark per step.
+
+    Returns an empty string if fewer than two steps can be shown. Steps with identical renders have no place on a scale in dB.
+    """
+    judge = target.figure
+    # Find the chosen step by identity: other steps may have equal figures.
+    points = [(s.size, at, s) for s in steps if s.measurement and (at := s.measurement.figure(judge)) is not None]
+    if len(points) < 2:
+        return ""
+    limit = getattr(target, "limit", None) if target.limit_bytes is None else None
+    low_x, high_x, ticks_x = nice_range([p[0] for p in points] + ([target.limit_bytes] if target.limit_bytes else []))
+    low_y, high_y, ticks_y = nice_range([p[1] for p in points] + ([limit] if limit is not None else []))
+    unit, word = _unit(high_x)
+
+    def x(value: float) -> float:
+        return _LEFT + (value - low_x) / (high_x - low_x) * (_RIGHT - _LEFT)
+
+    def y(value: float) -> float:
+        return _BOTTOM - (value - low_y) / (high_y - low_y) * (_BOTTOM - _TOP)
+
+    return render(
+        "step_chart.svg",
+        width=WIDTH,
+        height=HEIGHT,
+        left=_LEFT,
+        right=_RIGHT,
+        top=_TOP,
+        bottom=_BOTTOM,
+        judge=judge,
+        target=target,
+        chosen=chosen,
+        unit=word,
+        ticks_x=[(tick / unit, x(tick)) for tick in ticks_x],
+        ticks_y=[(tick, y(tick)) for tick in ticks_y],
+        limit_x=None if target.limit_bytes is None else x(target.limit_bytes),
+        limit_y=None if limit is None else y(limit),
+        marks=[(x(size), y(at), step) for size, at, step in points],
+    )
+
+
+def _unit(most: float) -> tuple[int, str]:
+    for scale, word in ((10**9, "GB"), (10**6, "MB"), (10**3, "kB")):
+        if most >= scale:
+            return scale, word
+    return 1, "bytes"
+
+
+def nice_range(values: Sequence[float], most: int = 5) -> tuple[float, float, list[float]]:
+    """Choose the ends of an axis with a margin around all values, and at most `most` + 1 round ticks.
+
+    >>> nice_range([0.0, 1.0])
+    (-0.08, 1.08, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+    """
+    low, high = min(values), max(values)
+    span = high - low or abs(high) or 1.0
+    low, high = low - 0.08 * span, high + 0.08 * span
+    raw = (high - low) / (most + 1)
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * (1 - 1e-9))
+    first, last = math.ceil(low / step), math.floor(high / step)
+    return low, high, [round(index * step, 12) for index in range(first, last + 1)]
+
+
+FEW_ROWS = 16  # With more steps than this, their table is folded up. With more views, their table scrolls.
 
 
 def compress_page(result: CompressResult, material: Material) -> str:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
 GREY, INK = "#7a7a7a", "#222222"
-SHORT = 8
-"""Notes shorter than this many letters are centred over their point."""
+SHORT = 8  # Notes shorter than this many letters are centred over their point
 MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
 LINEAR_BELOW = 0.1
 LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
@@ -49,28 +48,17 @@ _STYLE: dict[Any, Any] = {
 class Series:
     """Points of one kind. Points whose y is None are left out.
 
-    Parameters
-    ----------
-    label : str
-        Name in the legend.
-    x, y : sequence
-        Coordinates of the points.
-    line : bool
-        Join the points by a line.
-    published : bool
-        The figures come from the paper and not from this run: draw grey, open marks.
-    notes : sequence of str
-        Text beside each point.
-    broken : sequence of float
-        x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the chart.
+    `x`, `y`: coordinates of the points.
     """
 
-    label: str
+    label: str  # name in the legend
     x: Sequence[float]
     y: Sequence[float | None]
-    line: bool = True
-    published: bool = False
-    notes: Sequence[str] = ()
+    line: bool = True  # join the points by a line
+    published: bool = False  # the figures come from the paper and not from this run: draw grey, open marks
+    notes: Sequence[str] = ()  # text beside each point
+    # x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the
+    # chart.
     broken: Sequence[float] = ()
 
 
@@ -78,114 +66,63 @@ class Series:
 class LineChart:
     """Curves over a common axis.
 
-    Parameters
-    ----------
-    limit : float, optional
-        Mark this y with a line, such as a target.
-    doublings : bool
-        Show x in powers of two.
-    megabytes : bool
-        Show x in MB, on a log scale.
-    magnitudes : bool
-        Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
-    floating : bool
-        y need not start at zero, such as for fidelity.
-    log_x, log_y : bool
-        Use a plain log scale, such as for times. All values must be above zero.
-    front : sequence of (x, y)
-        Pareto front: points that no other point beats, joined by steps under the series.
-    upright : (x, str), optional
-        Mark this x with a line and its text: a point without a y.
+    `log_x`: use a plain log scale, such as for times. All values must be above zero.
     """
 
     title: str
     x_label: str
     y_label: str
     series: tuple[Series, ...]
-    limit: float | None = None
-    doublings: bool = False
+    limit: float | None = None  # mark this y with a line, such as a target
+    doublings: bool = False  # show x in powers of two
+    # Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
     magnitudes: bool = False
-    megabytes: bool = False
-    floating: bool = False
+    megabytes: bool = False  # show x in MB, on a log scale
+    floating: bool = False  # y need not start at zero, such as for fidelity
     log_x: bool = False
-    log_y: bool = False
+    # Pareto front: points that no other point beats, joined by steps under the series.
     front: Sequence[tuple[float, float]] = ()
-    upright: tuple[float, str] | None = None
 
 
 @dataclass(frozen=True)
 class BarChart:
-    """Grouped bars from zero, each with its value.
-
-    Parameters
-    ----------
-    groups : sequence of str
-        Along the axis.
-    bars : dict
-        One value per group, by label.
-    limit : float, optional
-        Mark this level with a line, and bars above it with a cross.
-    """
+    """Grouped bars from zero, each with its value."""
 
     title: str
     y_label: str
-    groups: Sequence[str]
-    bars: dict[str, Sequence[float | None]]
+    groups: Sequence[str]  # along the axis
+    bars: dict[str, Sequence[float | None]]  # one value per group, by label
     digits: int = 2
-    limit: float | None = None
+    limit: float | None = None  # mark this level with a line, and bars above it with a cross
 
 
 @dataclass(frozen=True)
 class DotChart:
-    """Grouped dots on a log axis with text beside them, for values of many magnitudes.
-
-    Parameters
-    ----------
-    groups : sequence of str
-        Along the axis.
-    dots : dict
-        One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
-    words : dict
-        Text beside each dot, arranged as `dots`.
-    """
+    """Grouped dots on a log axis with text beside them, for values of many magnitudes."""
 
     title: str
     y_label: str
-    groups: Sequence[str]
+    groups: Sequence[str]  # along the axis
+    # One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
     dots: dict[str, Sequence[float | None]]
-    words: dict[str, Sequence[str]]
+    words: dict[str, Sequence[str]]  # text beside each dot, arranged as `dots`
 
 
 @dataclass(frozen=True)
 class PlaneChart:
-    """A grid of cells over the prune rate and the SH rate, with lines and points on it.
-
-    Parameters
-    ----------
-    cells : dict
-        Value of each cell, by its centre (x, y).
-    step : float
-        Side of a cell.
-    top : float
-        Values from here up share the last colour.
-    frontier : sequence of (x, y)
-        Line on which the limit is reached.
-    marked : sequence of (x, y)
-        Cells to mark with a dot: the paper's candidates.
-    path : sequence of (x, y)
-        Points that a search visited, in order. The last one is its result.
-    """
+    """A grid of cells over the prune rate and the SH rate, with lines and points on it."""
 
     title: str
     x_label: str
     y_label: str
     colour_label: str
-    cells: dict[tuple[float, float], float]
-    step: float
-    top: float
-    frontier: Sequence[tuple[float, float]]
+    cells: dict[tuple[float, float], float]  # value of each cell, by its centre (x, y)
+    step: float  # side of a cell
+    top: float  # values from here up share the last colour
+    frontier: Sequence[tuple[float, float]]  # line on which the limit is reached
     frontier_label: str
-    marked: Sequence[tuple[float, float]]
+    marked: Sequence[tuple[float, float]]  # cells to mark with a dot: the paper's candidates
+    # Points that a search visited, in order. The last one is its result.
     path: Sequence[tuple[float, float]] = field(default=())
     answer: tuple[float, float] | None = None
 
@@ -290,12 +227,6 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     if chart.front:
         steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
         axes.step(*_split(sorted(chart.front)), where="post", label="Pareto front", **steps)
-    if chart.upright is not None:
-        at, words = chart.upright
-        axes.axvline(at, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-        axes.annotate(
-            words, (at, 0.02), (-3, 0), ("data", "axes fraction"), "offset points", ha="right", rotation=90, fontsize=8
-        )
     # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
@@ -305,12 +236,7 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-    if chart.log_y:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-        axes.yaxis.set_minor_locator(NullLocator())
-    elif not chart.floating:
+    if not chart.floating:
         axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
@@ -354,13 +280,7 @@ def _bars(axes: Axes, chart: BarChart) -> None:
         left = [group - 0.4 + (number + 0.5) * width for group in range(len(chart.groups))]
         shown = [value or 0.0 for value in values]
         bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
-        axes.bar_label(
-            bars,
-            [_bar_words(value, chart) for value in values],
-            padding=2,
-            fontsize=7.5,
-            color=INK,
-        )
+        axes.bar_label(bars, [_bar_words(value, chart) for value in values], padding=2, fontsize=7.5, color=INK)
     axes.axhline(0.0, color=INK, linewidth=0.8)
     if chart.limit is not None:
         axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))

@@ -7,17 +7,16 @@ and targets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
-from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.packed.bitspec import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import (
     decibel,
     line,
@@ -36,68 +35,15 @@ from flexgs_edge.units import format_size
 class CompressResult:
     """Result of `compress`.
 
-    Parameters
-    ----------
-    scene, views : SceneInfo, ViewsInfo or None
-        The input scene, and the views; `views` is `None` for a run without cameras.
-    output : str or None
-        The file written; `None` in a dry run.
-    size : int
-        Bytes of the file. A dry run gives the exact size that the file would have.
-    count, sh_count : int
-        Gaussians kept, and those of them with SH above degree 0.
-    prune_rate, sh_rate : float
-        Shares of all Gaussians: those removed, and those kept without their SH.
-    method, score, select : str
-        Options of the run.
-    bits : dict
-        Bits per attribute (`paper`).
-    groups : dict
-        Quantization groups per channel, by attribute (`paper`).
-    steps : dict or None
-        Step sizes by attribute (`best`).
-    target : str or None
-        The target in words; `None` for fixed rates.
-    decided_by : str or None
-        `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates.
-    reached : bool or None
-        Whether the deciding views meet the target; `None` for fixed rates.
-    decision_views : str
-        The kind of views that decided: `held-out`, `training` or `none`.
-    search : SearchResult or None
-        Every step of the search; `None` for fixed rates.
-    sensitivity : tuple of Sensitivity
-        Loss per attribute and bit width, as `--bits auto` measured it.
-    quality : Quality or None
-        Quality of the decoded file over `quality_views`; `None` without cameras.
-    quality_views : str
-        The kind of views that `quality` is measured on: `held-out`, `training` or `none`.
-    score_cache : str or None
-        File that keeps the scores between runs.
-    scores_reused : bool
-        Whether the scores came from that file.
-    run : RunInfo
-        Times, memory and device.
-    format : str
-        `fgs`, `spz`, `sog` or `compressed.ply`.
-    file_sh_degree : int or None
-        SH degree of the file.
-    scored : Scored or None
-        Scored views and unseen Gaussians of a search by measured costs (`best`).
-    training_fidelity : float or None
-        Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
-    warnings : tuple of str
-        Reasons to trust the figures less. Each names a number and what to do.
-    promise : KeptPromise or None
-        How the bounds beside the target stand on the deciding views; `None` without such bounds.
-    preview_bytes : int
-        Bytes of the file that are its preview (`best`); 0 if it has none.
+    `scene`, `views`: the input scene, and the views; `views` is `None` for a run without cameras. `count`, `sh_count`:
+    Gaussians kept, and those of them with SH above degree 0. `prune_rate`, `sh_rate`: shares of all Gaussians: those
+    removed, and those kept without their SH. `method`, `score`, `select`: options of the run.
     """
 
     scene: SceneInfo
     views: ViewsInfo | None
-    output: str | None
-    size: int
+    output: str | None  # the file written; `None` in a dry run
+    size: int  # Bytes of the file. A dry run gives the exact size that the file would have.
     count: int
     sh_count: int
     prune_rate: float
@@ -105,27 +51,29 @@ class CompressResult:
     method: str
     score: str | None
     select: str
-    bits: dict[str, int]
-    groups: dict[str, int]
-    steps: dict[str, Any] | None
-    target: str | None
-    decided_by: str | None
-    reached: bool | None
-    decision_views: str
-    search: SearchResult | None
-    sensitivity: tuple[Sensitivity, ...]
-    quality: Quality | None
-    quality_views: str
-    score_cache: str | None
-    scores_reused: bool
-    run: RunInfo
-    format: str = "fgs"
-    file_sh_degree: int | None = None
-    scored: Scored | None = None
+    bits: dict[str, int]  # bits per attribute (`paper`)
+    groups: dict[str, int]  # quantization groups per channel, by attribute (`paper`)
+    steps: dict[str, Any] | None  # step sizes by attribute (`best`)
+    target: str | None  # the target in words; `None` for fixed rates
+    decided_by: str | None  # `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates
+    reached: bool | None  # whether the deciding views meet the target; `None` for fixed rates
+    decision_views: str  # the kind of views that decided: `held-out`, `training` or `none`
+    search: SearchResult | None  # every step of the search; `None` for fixed rates
+    sensitivity: tuple[Sensitivity, ...]  # loss per attribute and bit width, as `--bits auto` measured it
+    quality: Quality | None  # quality of the decoded file over `quality_views`; `None` without cameras
+    quality_views: str  # the kind of views that `quality` is measured on: `held-out`, `training` or `none`
+    score_cache: str | None  # file that keeps the scores between runs
+    scores_reused: bool  # whether the scores came from that file
+    run: RunInfo  # times, memory and device
+    format: str = "fgs"  # `fgs`, `spz`, `sog` or `compressed.ply`
+    file_sh_degree: int | None = None  # SH degree of the file
+    scored: Scored | None = None  # scored views and unseen Gaussians of a search by measured costs (`best`)
+    # Fidelity of the decoded file on some training views, dB. Measured only if `quality` comes from held-out views.
     training_fidelity: float | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # Reasons to trust the figures less. Each names a number and what to do.
+    # How the bounds beside the target stand on the deciding views; `None` without such bounds.
     promise: KeptPromise | None = None
-    preview_bytes: int = 0
+    preview_bytes: int = 0  # bytes of the file that are its preview (`best`); 0 if it has none
 
     @property
     def ratio(self) -> float:
@@ -144,45 +92,18 @@ class CompressResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "compress",
-            "input": self.scene.to_json(),
-            "views": self.views.to_json() if self.views else None,
-            "output": self.output,
-            "format": self.format,
-            "file_sh_degree": self.file_sh_degree,
-            "size": self.size,
-            "preview_bytes": self.preview_bytes,
-            "ratio": round(self.ratio, 4),
-            "ratio_without_normals": round(self.ratio_without_normals, 4),
-            "ratio_of_input": rounded(self.ratio_of_input),
-            "count": self.count,
-            "sh_count": self.sh_count,
-            "prune_rate": self.prune_rate,
-            "sh_rate": self.sh_rate,
-            "method": self.method,
-            "score": self.score,
-            "select": self.select,
-            "bits": self.bits,
-            "groups": self.groups,
-            "steps": self.steps,
-            "target": self.target,
-            "decided_by": self.decided_by,
-            "reached": self.reached,
-            "promise": promise_json(self.promise),
-            "decision_views": self.decision_views,
-            "search": [step_json(step) for step in self.search.steps] if self.search else [],
-            "sensitivity": [{**asdict(item), "loss": item.loss} for item in self.sensitivity],
-            "quality": quality_json(self.quality) if self.quality else None,
-            "quality_views": self.quality_views,
-            "training_fidelity": rounded(self.training_fidelity),
-            "scored": asdict(self.scored) if self.scored else None,
-            "warnings": list(self.warnings),
-            "score_cache": self.score_cache,
-            "scores_reused": self.scores_reused,
-            "run": self.run.to_json(),
-        }
+        return record(
+            "compress",
+            self,
+            ratio=round(self.ratio, 4),
+            ratio_without_normals=round(self.ratio_without_normals, 4),
+            ratio_of_input=rounded(self.ratio_of_input),
+            promise=promise_json(self.promise),
+            search=[step_json(step) for step in self.search.steps] if self.search else [],
+            sensitivity=[{**asdict(item), "loss": item.loss} for item in self.sensitivity],
+            quality=quality_json(self.quality) if self.quality else None,
+            training_fidelity=rounded(self.training_fidelity),
+        )
 
     def summary(self) -> str:
         """Return the text that the command prints."""
@@ -266,25 +187,11 @@ class EvaluateResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "evaluate",
-            "input": self.scene.to_json(),
-            "reference": self.reference.to_json(),
-            "views": self.views.to_json(),
-            "quality": quality_json(self.quality),
-            "quality_views": self.quality_views,
-            "warnings": list(self.warnings),
-            "run": self.run.to_json(),
-        }
+        return record("evaluate", self, quality=quality_json(self.quality))
 
     def summary(self) -> str:
         """Return the text that the command prints."""
-        lines = [
-            *scene_lines("scene", self.scene),
-            *scene_lines("against", self.reference),
-            *view_lines(self.views),
-        ]
+        lines = [*scene_lines("scene", self.scene), *scene_lines("against", self.reference), *view_lines(self.views)]
         lines += quality_lines(self.quality, f"{len(self.quality.views)} {self.quality_views} views")
         lines += [line("warning", words) for words in self.warnings]
         lines += ["", *_view_table(self.quality.views)]
@@ -292,47 +199,31 @@ class EvaluateResult:
 
 
 def _view_table(views: Sequence[ViewQuality]) -> list[str]:
-    rows: list[tuple[str, ...]] = [
-        (
-            "view",
-            "fidelity",
-            "covered",
-            "coverage",
-            "SSIM to ref.",
-            "FLIP to ref.",
-            "drop",
-            "PSNR",
-            "of original",
-            "SSIM",
-            "of original",
-            "FLIP",
-            "of original",
-        )
+    def figure(head: str, name: str) -> tuple[str, Callable[[ViewQuality], str]]:
+        return head, lambda view: similar(getattr(view, name))
+
+    def against_photo(head: str, name: str) -> tuple[str, Callable[[ViewQuality], str]]:
+        return head, lambda view: "-" if view.photo_error is None else decibel(getattr(view, name))
+
+    columns: list[tuple[str, Callable[[ViewQuality], str]]] = [
+        ("view", lambda view: view.name),
+        ("fidelity", lambda view: decibel(view.fidelity)),
+        ("covered", lambda view: decibel(view.covered_fidelity) if view.coverage else "-"),
+        ("coverage", lambda view: f"{100 * view.coverage:.3g} %"),
+        figure("SSIM to ref.", "ssim_original"),
+        figure("FLIP to ref.", "flip_original"),
+        against_photo("drop", "drop"),
+        against_photo("PSNR", "psnr"),
+        against_photo("of original", "original_psnr"),
+        figure("SSIM", "ssim_photo"),
+        figure("of original", "original_ssim"),
+        figure("FLIP", "flip_photo"),
+        figure("of original", "original_flip"),
     ]
-    with_lpips = any(view.lpips_original is not None for view in views)
-    if with_lpips:
-        rows[0] += ("LPIPS to ref.", "LPIPS", "of original")
-    for view in views:
-        photo = view.photo_error is not None
-        rows.append(
-            (
-                view.name,
-                decibel(view.fidelity),
-                decibel(view.covered_fidelity) if view.coverage else "-",
-                f"{100 * view.coverage:.3g} %",
-                similar(view.ssim_original),
-                similar(view.flip_original),
-                decibel(view.drop) if photo else "-",
-                decibel(view.psnr) if photo else "-",
-                decibel(view.original_psnr) if photo else "-",
-                similar(view.ssim_photo),
-                similar(view.original_ssim),
-                similar(view.flip_photo),
-                similar(view.original_flip),
-            )
-        )
-        if with_lpips:
-            rows[-1] += tuple(map(similar, (view.lpips_original, view.lpips_photo, view.original_lpips)))
+    if any(view.lpips_original is not None for view in views):
+        columns += [figure("LPIPS to ref.", "lpips_original"), figure("LPIPS", "lpips_photo")]
+        columns.append(figure("of original", "original_lpips"))
+    rows = [[head for head, _ in columns], *([cell(view) for _, cell in columns] for view in views)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join(

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import SIMILARITIES, RunInfo, SceneInfo, ViewsInfo
 from flexgs_edge.units import format_mib, format_size, smaller_words
 
 if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
 
 
-FAR_SHOWN = 4
-"""Names of views that one line shows."""
+FAR_SHOWN = 4  # Names of views that one line shows
 
 
 def scene_lines(label: str, scene: SceneInfo) -> list[str]:
@@ -45,15 +44,11 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
     """Describe drop, fidelity and the worst view; `where` names the views that were measured."""
     lines = []
     if quality.drop is not None:
-        also = (
-            ""
-            if quality.ssim_photo is None
-            else f", SSIM {similar(quality.original_ssim)} -> {similar(quality.ssim_photo)}"
+        also = "".join(
+            f", {name.upper()} {similar(getattr(quality, f'original_{name}'))} -> {similar(found)}"
+            for name in SIMILARITIES
+            if (found := getattr(quality, f"{name}_photo")) is not None
         )
-        if quality.flip_photo is not None:
-            also += f", FLIP {similar(quality.original_flip)} -> {similar(quality.flip_photo)}"
-        if quality.lpips_photo is not None:
-            also += f", LPIPS {similar(quality.original_lpips)} -> {similar(quality.lpips_photo)}"
         lines.append(
             line(
                 "drop",
@@ -64,11 +59,11 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
         lines += _photo_lines(quality)
     identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
     unit = "" if quality.fidelity is None else " dB"
-    also = "" if quality.ssim_original is None else f", SSIM {similar(quality.ssim_original)}"
-    if quality.flip_original is not None:
-        also += f", FLIP {similar(quality.flip_original)}"
-    if quality.lpips_original is not None:
-        also += f", LPIPS {similar(quality.lpips_original)}"
+    also = "".join(
+        f", {name.upper()} {similar(found)}"
+        for name in SIMILARITIES
+        if (found := getattr(quality, f"{name}_original")) is not None
+    )
     lines.append(
         line(
             "fidelity",

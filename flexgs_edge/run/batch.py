@@ -27,8 +27,7 @@ COMPANIONS = (
 """Names beside scenes that are no scenes and need no words."""
 _SUFFIXES = tuple(each for each in SUFFIXES if each.startswith("."))
 _ENDINGS = sorted((each + packed for each in _SUFFIXES for packed in ("", GZ)), key=len, reverse=True)
-_NAMED = 5
-"""Most skipped names in one line of the log."""
+_NAMED = 5  # Most skipped names in one line of the log
 
 
 def is_batch(inputs: Sequence[StrPath], output: StrPath | None) -> bool:
@@ -127,10 +126,7 @@ def output_names(scenes: Sequence[str], suffix: str) -> list[str]:
     >>> output_names(["x/a.ply", "y/a.ply"], ".fgs")
     ['x-a.ply.fgs', 'y-a.ply.fgs']
 
-    Raises
-    ------
-    InputError
-        If two names stay the same.
+    Raises `InputError` if two names stay the same.
     """
     parts = [_parts(scene) for scene in scenes]
     depths = [0] * len(scenes)

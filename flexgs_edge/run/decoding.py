@@ -14,7 +14,7 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.tested import processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
@@ -29,42 +29,20 @@ docs/results/tuning.md#device_rows"""
 
 def decoder(
     device: str | None,
-    source: SceneSource,
-    budget: MemoryBudget,
-    clock: Stopwatch,
-    least: int = DEVICE_ROWS,
-    devices: Callable[[], list[DeviceInfo]] = processors_with_verdicts,
+    source: SceneSource,  # The scene to decode. Devices decode container version 2 only.
+    budget: MemoryBudget,  # pays for the OpenCL runtime
+    clock: Stopwatch,  # times the stage `device`
+    least: int = DEVICE_ROWS,  # without a named device, smaller scenes are decoded by NumPy
+    devices: Callable[[], list[DeviceInfo]] = processors_with_verdicts,  # lists the devices of this machine
 ) -> Backend | None:
     """Open the OpenCL device that decodes a scene.
 
     Only processors decode. One work-item decodes a whole chunk, and a single work-item of a GPU is too slow for that.
     NumPy gives the same results.
 
-    Parameters
-    ----------
-    device : str or None
-        As the user named it. Default: a processor, if one has a working driver, the scene has at least `least` Gaussians, and
-        its runtime fits into memory.
-    source : SceneSource
-        The scene to decode. Devices decode container version 2 only.
-    budget : MemoryBudget
-        Pays for the OpenCL runtime.
-    clock : Stopwatch
-        Times the stage `device`.
-    least : int, optional
-        Without a named device, smaller scenes are decoded by NumPy.
-    devices : callable, optional
-        Lists the devices of this machine.
-
-    Returns
-    -------
-    Backend or None
-        `None`: NumPy decodes.
-
-    Raises
-    ------
-    DeviceError
-        If the named device does not exist or failed its self-test.
+    `device`: as the user named it. Default: a processor, if one has a working driver, the scene has at least `least`
+    Gaussians, and its runtime fits into memory. Returns `None`: NumPy decodes. Raises `DeviceError` if the named device
+    does not exist or failed its self-test.
     """
     if device == "numpy" or not isinstance(source, GridSource):
         return None

@@ -9,19 +9,15 @@ from flexgs_edge.io.frames import RDF
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.scene.sample import some_positions
+from flexgs_edge.scene.source import some_positions
 from flexgs_edge.small_matrices import product
 
-FIT_GAP = 2.0
-"""We warn of overfitting when training views show this much more fidelity than held-out views, dB."""
-NEEDED_VIEWS = 16
-"""We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views"""
-UNSEEN_SHARE = 0.01
-"""We warn when automatic views miss more than this share of the Gaussians."""
+FIT_GAP = 2.0  # We warn of overfitting when training views show this much more fidelity than held-out views, dB
+NEEDED_VIEWS = 16  # We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views
+UNSEEN_SHARE = 0.01  # We warn when automatic views miss more than this share of the Gaussians
 
 
-BEHIND_SHARE = 0.5
-"""We warn when more than this share of the Gaussians lies behind all cameras."""
+BEHIND_SHARE = 0.5  # We warn when more than this share of the Gaussians lies behind all cameras
 _SAMPLE_ROWS = 2048
 _SAMPLE_VIEWS = 64
 
@@ -65,21 +61,9 @@ def doubts(
 ) -> tuple[str, ...]:
     """Warnings of a run, as sentences for a person.
 
-    Parameters
-    ----------
-    views : ViewSet
-        All views of the run.
-    scored : Scored or None
-        Numbers of scored views and of unseen Gaussians; `None` if the search measured no costs.
-    count : int
-        Gaussians of the scene.
-    trained, held_out : float or None
-        Mean fidelity on training views and on held-out views, dB; `None` if not measured.
-
-    Returns
-    -------
-    tuple of str
-        Empty if there is nothing to warn of.
+    `views`: all views of the run. `scored`: numbers of scored views and of unseen Gaussians; `None` if the search
+    measured no costs. `count`: Gaussians of the scene. `trained`, `held_out`: mean fidelity on training views and on
+    held-out views, dB; `None` if not measured. Returns empty if there is nothing to warn of.
     """
     found = []
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:

@@ -8,26 +8,17 @@ from dataclasses import dataclass
 from flexgs_edge.errors import BudgetError, FlexGSError, InputError
 from flexgs_edge.files import DISK_FULL
 
-INTERNAL = 1
-"""Exit code of a fault of ours."""
+INTERNAL = 1  # Exit code of a fault of ours
 TRACEBACKS = logging.getLogger("flexgs_edge.tracebacks")
 """Where `--debug` shows the tracebacks of errors that end one scene of several."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An error in words.
+    """An error in words."""
 
-    Parameters
-    ----------
-    words : str
-        One line that starts in lower case.
-    exit_code : int
-        `INTERNAL` for a fault of ours.
-    """
-
-    words: str
-    exit_code: int
+    words: str  # one line that starts in lower case
+    exit_code: int  # `INTERNAL` for a fault of ours
 
     @property
     def line(self) -> str:

@@ -15,38 +15,21 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.depths import visible_depths
 from flexgs_edge.views.references import References
 
-STEP = 2
-"""Every second pixel in both directions is read."""
-MOST = 8
-"""At most so many training poses, evenly spread, tell whether a result fits the scored poses too closely."""
-MADE_FROM = 6
-"""At most so many of the views that decide, evenly spread, get a nearer and a farther pose each."""
+STEP = 2  # Every second pixel in both directions is read
+MOST = 8  # At most so many training poses, evenly spread, tell whether a result fits the scored poses too closely
+MADE_FROM = 6  # At most so many of the views that decide, evenly spread, get a nearer and a farther pose each
 
 
 class FewPoses:
-    """Renders of the original from a few poses, and the fidelity of other scenes there.
-
-    Parameters
-    ----------
-    renderer : Renderer
-        Draws both scenes.
-    original : DeviceScene
-        The loaded original; the constructor draws its references.
-    cameras : sequence of Camera
-        The poses, at full resolution.
-    covered_decides : bool
-        As for `Quality`: fidelity is over covered pixels.
-    progress : Progress, optional
-        Shows a bar while the references are drawn.
-    """
+    """Renders of the original from a few poses, and the fidelity of other scenes there."""
 
     def __init__(
         self,
-        renderer: Renderer,
-        original: DeviceScene,
-        cameras: Sequence[Camera],
-        covered_decides: bool,
-        progress: Progress = SILENT,
+        renderer: Renderer,  # draws both scenes
+        original: DeviceScene,  # the loaded original; the constructor draws its references
+        cameras: Sequence[Camera],  # the poses, at full resolution
+        covered_decides: bool,  # as for `Quality`: fidelity is over covered pixels
+        progress: Progress = SILENT,  # shows a bar while the references are drawn
     ) -> None:
         self._renderer = renderer
         self._cameras = [camera.every(STEP) for camera in cameras]

@@ -11,40 +11,23 @@ from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.scene.source import SceneSource
 
-ROWS = 1 << 16
-"""We hash this many rows at a time."""
+ROWS = 1 << 16  # We hash this many rows at a time
 FIELDS = ("means", "log_scales", "quats", "opacity_logits")
 """Fields that change hits, weights or volumes. Colours change none of them."""
 
 
 def fingerprint(
-    source: SceneSource,
-    cameras: Sequence[Camera],
-    kind: str,
+    source: SceneSource,  # the scene as it is scored, without rows that were left out
+    cameras: Sequence[Camera],  # The training views, at the size they are drawn. Their names do not change the digest.
+    kind: str,  # the score, such as `gs`
     near: float,
     extent: str,
     antialiased: bool = False,
-    fields: Sequence[str] = FIELDS,
+    fields: Sequence[str] = FIELDS,  # fields of the scene to hash
 ) -> str:
     """Hash everything that scores depend on. Reads the scene once, by default without its colours.
 
-    Parameters
-    ----------
-    source : SceneSource
-        The scene as it is scored, without rows that were left out.
-    cameras : sequence of Camera
-        The training views, at the size they are drawn. Their names do not change the digest.
-    kind : str
-        The score, such as `gs`.
-    near, extent, antialiased : float, str, bool
-        How views are drawn.
-    fields : sequence of str
-        Fields of the scene to hash.
-
-    Returns
-    -------
-    str
-        The digest in hexadecimal.
+    `near`, `extent`, `antialiased`: how views are drawn. Returns the digest in hexadecimal.
     """
     digest = hashlib.sha256(
         f"{__version__} {kind} {near!r} {extent} {antialiased} {source.count} {len(cameras)}".encode()

@@ -7,14 +7,14 @@ from typing import Any
 
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.cameras.order import in_picture
+from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.run import Run
-from flexgs_edge.scene.sample import some_positions
+from flexgs_edge.scene.source import some_positions
 
-BLOCKS = 64
-"""Blocks of a view's passes on the device: as many as a processor of 16 cores has."""
+BLOCKS = 64  # Blocks of a view's passes on the device: as many as a processor of 16 cores has
 
 
 def foresee(
@@ -24,17 +24,9 @@ def foresee(
 
     Call it before the device is opened, and again when it is open.
 
-    Parameters
-    ----------
-    run : Run
-        With views.
-    opened : bool
-        The device is open, and its memory is taken from the budget.
-    search : callable, optional
-        Bytes that the search, or what the command does in its place, needs beside the comparison of views. Default: those
-        of drawing one view.
-    compares : bool
-        Views are compared (default), not drawn alone.
+    `run`: with views. `opened`: the device is open, and its memory is taken from the budget. `search`: bytes that the
+    search, or what the command does in its place, needs beside the comparison of views. Default: those of drawing one
+    view. `compares`: views are compared (default), not drawn alone.
     """
     budget, plan, views = run.budget, run.plan, run.seen
     reporting = views.held_out or views.train
@@ -49,6 +41,8 @@ def foresee(
         return held + compared_bytes + (drawing_bytes(run) if search is None else search())
 
     budget.foreseen = enough
+    if not opened and enough() > budget.free:
+        return_freed_memory()  # before the device takes its first large blocks
 
 
 def drawing_bytes(run: Run[Any]) -> int:

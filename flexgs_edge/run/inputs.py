@@ -31,35 +31,20 @@ LOG = logging.getLogger("flexgs_edge")
 class CheckedScene:
     """A scene whose values have been checked, and the settings that its file states.
 
-    Parameters
-    ----------
-    path : Path or None
-        As given; `None` for a scene from memory, which has no cameras or photos beside it.
-    source : SceneSource
-        Every value is finite; there is at least one Gaussian.
-    input_count, input_sh_degree : int
-        Gaussians and SH degree of the file, before anything was left out.
-    settings : dict
-        How a `.fgs` was made. Other files only state drawing settings, if any (`antialiased` in a `.spz`).
-    held_bytes : int
-        Bytes of the file's packed values in memory.
-    file_bytes : int or None
-        Bytes of the input file, or of all files that were read; `None` for a scene from memory.
-    frame : Frame
-        Directions of the axes in the file.
-    whole : int or None
-        Gaussians of the scene that a cut file is a part of.
+    `input_count`, `input_sh_degree`: Gaussians and SH degree of the file, before anything was left out.
     """
 
-    path: Path | None
-    source: SceneSource
+    path: Path | None  # as given; `None` for a scene from memory, which has no cameras or photos beside it
+    source: SceneSource  # every value is finite; there is at least one Gaussian
     input_count: int
     input_sh_degree: int
+    # How a `.fgs` was made. Other files only state drawing settings, if any (`antialiased` in a `.spz`).
     settings: dict[str, Any]
-    held_bytes: int = 0
+    held_bytes: int = 0  # bytes of the file's packed values in memory
+    # Bytes of the input file, or of all files that were read; `None` for a scene from memory.
     file_bytes: int | None = None
-    frame: Frame = RDF
-    whole: int | None = None
+    frame: Frame = RDF  # directions of the axes in the file
+    whole: int | None = None  # Gaussians of the scene that a cut file is a part of
 
     @property
     def drawn(self) -> SceneSource:
@@ -77,8 +62,7 @@ class CheckedScene:
         return self.ply_bytes - 12 * self.input_count
 
 
-ScenePlace = str | os.PathLike[str] | CheckedScene
-"""A scene file, a model folder, or a scene that is already open."""
+ScenePlace = str | os.PathLike[str] | CheckedScene  # A scene file, a model folder, or a scene that is already open
 
 
 def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> SceneSource:

@@ -33,10 +33,8 @@ LIBRARY_BYTES = 12 * 2**20
 """Bound on the bytes that loading Pillow and decoding with it take: docs/results/tuning.md#memory"""
 WORK_BYTES = 100
 """Bound on the bytes per pixel while a photo is decoded, or SSIM or FLIP is computed, with the backend's buffers."""
-CHECK_ROWS = 1 << 18
-"""Rows whose opacity is read at a time, where no view sees any Gaussian."""
-ESTIMATE_STEP = 2
-"""An estimate reads every second pixel in both directions."""
+CHECK_ROWS = 1 << 18  # Rows whose opacity is read at a time, where no view sees any Gaussian
+ESTIMATE_STEP = 2  # An estimate reads every second pixel in both directions
 
 
 def work_bytes(cameras: Sequence[Camera]) -> int:
@@ -50,33 +48,19 @@ class Judge:
     Without photos, the figures over covered pixels decide: background that the original leaves empty must not dilute an
     error. With photos, the plain figures decide, as everywhere else.
 
-    Parameters
-    ----------
-    bench : Bench
-        Draws both scenes. Kept images take at most a quarter of its free budget.
-    source : SceneSource
-        The original. A reference that was not kept is drawn again.
-    views : ViewSet
-        All views of the run.
-    indices : sequence of int
-        The views to compare.
-    with_photos : bool
-        Also compare with the photos, if there are any: at the exposure of the original, unless the run says otherwise.
-    base_psnr : float
-        PSNR of the original that the modelled drop starts from, dB.
-    reports : bool
-        The run reports these qualities, SSIM included. The judge then remembers them, and does not measure the same scene
-        twice.
+    `with_photos`: also compare with the photos, if there are any: at the exposure of the original, unless the run says
+    otherwise. `reports`: the run reports these qualities, SSIM included. The judge then remembers them, and does not
+    measure the same scene twice.
     """
 
     def __init__(
         self,
-        bench: Bench,
-        source: SceneSource,
-        views: ViewSet,
-        indices: Sequence[int],
+        bench: Bench,  # Draws both scenes. Kept images take at most a quarter of its free budget.
+        source: SceneSource,  # The original. A reference that was not kept is drawn again.
+        views: ViewSet,  # all views of the run
+        indices: Sequence[int],  # the views to compare
         with_photos: bool = True,
-        base_psnr: float = DEFAULT_BASE_PSNR,
+        base_psnr: float = DEFAULT_BASE_PSNR,  # PSNR of the original that the modelled drop starts from, dB
         reports: bool = False,
     ) -> None:
         self.bench, self.renderer = bench, bench.renderer
@@ -100,8 +84,7 @@ class Judge:
         self._coverage: list[float] = []
         self._coarse_error: dict[int, float] = {}
         self._known: dict[bytes, Quality] = {}
-        self.made: FewPoses | None = None
-        """Made poses that whole comparisons look at too."""
+        self.made: FewPoses | None = None  # Made poses that whole comparisons look at too
         # Reserve the memory now: scenes that are loaded later must not count on it.
         images = 1 if self.photos is None else 2
         wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
@@ -117,10 +100,7 @@ class Judge:
 
         A cluster does not draw them: its images do not tell what the original covers.
 
-        Raises
-        ------
-        InputError
-            When no view sees any Gaussian.
+        Raises `InputError` when no view sees any Gaussian.
         """
         self._original_error, self._original_ssim, self._coverage, self._gains = [], {}, [], []
         contrasts: list[float] = []
@@ -202,28 +182,17 @@ class Judge:
 
     def compare(
         self,
-        scene: DeviceScene,
-        with_ssim: bool = False,
-        progress: Progress = SILENT,
+        scene: DeviceScene,  # the loaded scene
+        with_ssim: bool = False,  # also measure SSIM
+        progress: Progress = SILENT,  # shows a bar
         lpips: Distance | None = None,
-        flip: bool = False,
+        flip: bool = False,  # Also measure FLIP, about as fast as SSIM. Searches do without it.
     ) -> Quality:
         """Measure the quality of `scene` over the views.
 
         With `reports`, a scene that equals an earlier one bit for bit returns the earlier quality without drawing.
 
-        Parameters
-        ----------
-        scene : DeviceScene
-            The loaded scene.
-        with_ssim : bool
-            Also measure SSIM.
-        progress : Progress, optional
-            Shows a bar.
-        lpips : Distance, optional
-            Also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
-        flip : bool
-            Also measure FLIP, about as fast as SSIM. Searches do without it.
+        `lpips`: also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
         whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None

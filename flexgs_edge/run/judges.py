@@ -22,12 +22,7 @@ from flexgs_edge.views.bench import Bench
 class Judges:
     """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with views.
-    bench : Bench
-        Draws.
+    `run`: planned, with views. `bench`: draws.
     """
 
     def __init__(self, run: Run[Any], bench: Bench) -> None:
@@ -38,8 +33,7 @@ class Judges:
         self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
         self.training: FewPoses | None = None
         self._made: FewPoses | None = None
-        self.trained: float | None = None
-        """Fidelity of what was measured last on training poses, dB."""
+        self.trained: float | None = None  # Fidelity of what was measured last on training poses, dB
 
     def _judge(self, indices: list[int], reports: bool) -> Judge:
         run = self._run

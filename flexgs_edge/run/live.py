@@ -23,12 +23,9 @@ from flexgs_edge.viewer.assets import LIVE, web_files
 from flexgs_edge.viewer.join import join_modules
 from flexgs_edge.viewer.scene_page import page_config
 
-SCENE_MOST = 8_000_000
-"""Most bytes of a scene in a report; it takes a third more there."""
-ROWS_MOST = 400_000
-"""Most Gaussians of an original: more do not fit into that."""
-ROW_BYTES = 59 * 4 * 4
-"""Memory that coding takes for a Gaussian: its values, their forms and codes."""
+SCENE_MOST = 8_000_000  # Most bytes of a scene in a report; it takes a third more there
+ROWS_MOST = 400_000  # Most Gaussians of an original: more do not fit into that
+ROW_BYTES = 59 * 4 * 4  # Memory that coding takes for a Gaussian: its values, their forms and codes
 
 
 def live_scenes(run: Run[Options], path: str | os.PathLike[str], first: int) -> Live:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.run_info import RunInfo
 from flexgs_edge.run.counted_backend import counted_backend
+from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.spent import run_info
@@ -15,32 +17,28 @@ from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.worker import Drawing
 
 
-def open_bench(run: Run[Any], cluster: str | None = None) -> Bench:
+def open_bench(
+    run: Run[Any], cluster: str | None = None, needed: Callable[[], int] | None = None, compares: bool = True
+) -> Bench:
     """Open the renderer, and the cluster if there is one. Close the bench when done.
 
-    Parameters
-    ----------
-    run : Run
-        Names the device, and pays for memory.
-    cluster : str, optional
-        Address of a Dask scheduler, or `local:N`. Each worker gets the run's whole memory limit. Default: no cluster.
+    With `needed`, errors about the memory limit name one that is enough for the whole run: see `foresee`.
 
-    Returns
-    -------
-    Bench
-        Opening it is timed as the stages `device` and `cluster`.
-
-    Raises
-    ------
-    DeviceError
-        If the named device does not exist or failed its self-test.
+    `run`: names the device, and pays for memory. `cluster`: address of a Dask scheduler, or `local:N`. Each worker gets
+    the run's whole memory limit. Default: no cluster. Opening it is timed as the stages `device` and `cluster`.
+    Raises `DeviceError` if the named device does not exist or failed its self-test.
     """
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None
     assert options.extent is not None and options.antialiased is not None
     drawing = options.near, options.background, options.extent, options.antialiased
+    if needed is not None:
+        with run.clock.stage("open"):
+            foresee(run, False, needed, compares)
     backend = counted_backend(options.device, run.budget, run.clock)
     bench = Bench(Renderer(backend, run.budget, *drawing))
+    if needed is not None:
+        foresee(run, True, needed, compares)
     try:
         if cluster is not None:
             with run.clock.stage("cluster"):

@@ -17,8 +17,7 @@ from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.scene.source import SceneSource
 
-FOLDERS = ("lod-meta.json", "meta.json")
-"""Files that make a folder a scene, the first that is there."""
+FOLDERS = ("lod-meta.json", "meta.json")  # Files that make a folder a scene, the first that is there
 SUFFIXES = (".fgs", ".ply", *FORMATS)
 _PLY = (".ply", ".compressed.ply")
 """Formats that a file has if its first bytes say so, whatever its suffix: both are called .ply in the wild."""
@@ -26,27 +25,13 @@ _PLY = (".ply", ".compressed.ply")
 
 @dataclass(frozen=True)
 class Opened:
-    """An open scene, and what is known of its file.
+    """An open scene, and what is known of its file."""
 
-    Parameters
-    ----------
-    source : SceneSource
-        With its axes in RDF.
-    suffix : str
-        Suffix of the file's format, which its name may lack.
-    bytes : int
-        Bytes of the file as it lies there, packed or not; of all files that are read, where there are several.
-    frame : Frame
-        Directions of the axes in the file.
-    version : int or None
-        Version of the format, if the file states one.
-    """
-
-    source: SceneSource
-    suffix: str
-    bytes: int
-    frame: Frame
-    version: int | None
+    source: SceneSource  # with its axes in RDF
+    suffix: str  # suffix of the file's format, which its name may lack
+    bytes: int  # bytes of the file as it lies there, packed or not; of all files that are read, where there are several
+    frame: Frame  # directions of the axes in the file
+    version: int | None  # version of the format, if the file states one
 
 
 def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> SceneSource:
@@ -54,17 +39,8 @@ def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> S
 
     A folder that holds a `point_cloud.ply` stands for it.
 
-    Returns
-    -------
-    SceneSource
-        With its axes in RDF.
-
-    Raises
-    ------
-    InputError
-        If the path does not exist or its suffix is unknown.
-    FormatError
-        If the file does not follow its format.
+    Returns with its axes in RDF. Raises `InputError` if the path does not exist or its suffix is unknown. Raises
+    `FormatError` if the file does not follow its format.
     """
     return open_file(path, reading).source
 

@@ -11,7 +11,6 @@ from flexgs_edge.cameras.camera import split_views
 from flexgs_edge.codec.v2.header import PREVIEW_MOST
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import (
     LEAST_SSIM,
     SSIM_PER_DB,
@@ -22,7 +21,7 @@ from flexgs_edge.goals.promise import (
     promised,
     worst_allowed,
 )
-from flexgs_edge.goals.steps import REFINE_STEPS
+from flexgs_edge.goals.steps import REFINE_STEPS, Choice
 from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, min_ratio
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
@@ -30,20 +29,16 @@ from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 
 LOG = logging.getLogger("flexgs_edge")
 
-NO_PHOTOS = "none"
-"""`--images none`: do not use the photos beside the scene."""
-AUTO_CAMERAS = "auto"
-"""`--cameras auto`: generate camera views from the scene itself."""
-NO_CAMERAS = "none"
-"""`--cameras none`: no views at all. Only fixed rates work then."""
+NO_PHOTOS = "none"  # `--images none`: do not use the photos beside the scene
+AUTO_CAMERAS = "auto"  # `--cameras auto`: generate camera views from the scene itself
+NO_CAMERAS = "none"  # `--cameras none`: no views at all. Only fixed rates work then.
 METHODS = ("best", "paper")
 EFFORT_WORDS = tuple(REFINE_STEPS)
 SCORES = ("gs", "meson")
 SELECTS = ("test", "train")
 EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
-NONE = "none"
-"""Lifts a bound of the promise."""
+NONE = "none"  # Lifts a bound of the promise
 LAYERS_MOST = 4
 DISTIL_MOST = 100_000
 """Most iterations of distillation. This many take hours on any machine; beyond a few thousand nothing is gained."""
@@ -64,8 +59,7 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "scratch": ("best", None),
     "resume": ("best", False),
     "cluster": ("best", None),
-}
-"""Options that only one `--method` knows: the method and the default of each."""
+}  # Options that only one `--method` knows: the method and the default of each
 
 
 def check_method(method: str, given: Iterable[str]) -> None:
@@ -84,45 +78,7 @@ def check_method(method: str, given: Iterable[str]) -> None:
 class ViewOptions:
     """Where the views come from, and how they are drawn.
 
-    Parameters
-    ----------
-    cameras : str, optional
-        A camera file, a folder with one, `auto`, or `none`. Default: the cameras beside the scene, else `auto`.
-    ignore_distortion : bool
-        Use the poses of cameras with lens distortion, without their photos. Default: undistort the photos.
-    dataparser : str, optional
-        nerfstudio's `dataparser_transforms.json` of the training, for poses of a transforms.json. Default: the one found.
-    images : str, optional
-        Folder of photos, or `none`. Default: `images/` beside the scene.
-    exposure : {"fit", "none"}
-        Fit the photos to the exposure and white balance of the original, where they differ, or not. Default: `fit`.
-    holdout : int
-        Hold out every n-th view in order of name; 0 holds out none.
-    resolution : int
-        Scale wider views down to this many pixels. Fewer pixels are faster.
-    near : float, optional
-        Near plane, scene units. Default: as a `.fgs` states, else 0.2. Automatic views of small scenes need less, and get it.
-    background : tuple of float, optional
-        Red, green, blue in [0, 1]. Default: as a `.fgs` or `cfg_args` states, else black.
-    extent : str, optional
-        How far a Gaussian reaches on the screen: `exact` or `inria`. Default: as a `.fgs` states, else `exact`.
-    antialiased : bool, optional
-        Reduce opacities to make up for the screen-space dilation. Default: as a `.fgs` or `cfg_args` states, else no.
-    up : tuple of float, optional
-        Direction of up for automatic views, in the program's frame (that of a decompressed .ply). Default: what the scene
-        shows, else -y.
-    drop_invalid : bool
-        Leave out Gaussians with NaN, infinity or zero quaternions. Default: raise `InputError` for them.
-    frame : str, optional
-        Directions of the axes of the scene's file, such as `RUB`. Default: as the file says, else as its format has it.
-    lod : int, optional
-        Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
-    sh_degree : int, optional
-        Leave out SH above this degree. Default: keep all.
-    memory_limit : int, optional
-        Bytes for the whole process. Default: three quarters of the free memory.
-    device : str, optional
-        OpenCL device (number, part of its name, `cpu` or `gpu`) or `numpy`. Default: the one that `devices` shows as chosen.
+    `flexgs-edge compress --expert` explains every option; `None` stands for its default.
     """
 
     cameras: str | None = None
@@ -168,84 +124,9 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class CompressOptions(ViewOptions):
-    """All options of `compress` besides input and output.
+    """All options of `compress` besides input and output: see `flexgs-edge compress --expert`.
 
-    Parameters
-    ----------
-    method : {"best", "paper"}
-        `best` (the default) measures the cost of each Gaussian and codes with entropy coding. `paper` is the published
-        method: faster, larger files.
-    select : {"test", "train"}
-        Views that decide when the search stops: the held-out views (`test`) or the training views. Default: `test`.
-    score : {"gs", "meson"}
-        Importance score: `gs` or `meson` (`paper`). Default: `gs`.
-    score_cache : str, optional
-        Keep the scores in this file. Reuse them when scene, views and score are the same (`paper`).
-    max_drop, min_fidelity : float, optional
-        Quality target: most PSNR lost, or least fidelity, dB. Default: `max_drop=1`.
-    promise : {"whole", "mean"}
-        What holds beside the target: bounds on the worst view, on SSIM and on made poses (`whole`), or nothing (`mean`).
-        Default: `whole`.
-    max_worst_drop : float or "none", optional
-        Largest drop of any single deciding view, dB. Default: 1.5 times the drop that the target allows in the mean, and 0.2 dB.
-    max_ssim_drop : float or "none", optional
-        Largest loss of SSIM, mean over the deciding views. Default: 0.015 for each dB that the target allows.
-    max_size : int, optional
-        Size target: most bytes of the file.
-    min_ratio : float, optional
-        Size target: bytes of the scene as a PLY divided by file bytes, whatever format the scene was read from.
-    max_gaussians : int, optional
-        Most Gaussians of the result, whatever the target allows, for programs that draw only so many (`best`).
-    prune_rate, sh_rate : float, optional
-        Fixed rates from 0 to 1, instead of a search (`paper`). Give both or none.
-    bits : str
-        Bits per attribute, `paper`, `auto`, or `rtn4`, `rtn8`, ... (`paper`). Default: `paper`.
-    groups : int, optional
-        Quantization groups per channel (`paper`). Default: one group for about 512 rows.
-    base_psnr : float
-        Assumed PSNR of the original against its photos, for the modelled drop, dB.
-    trust_views : bool
-        Go on with cameras and photos that do not fit the scene. Default: raise `InputError`.
-    effort : {"fast", "balanced", "max"}
-        More effort makes smaller files and takes longer. `balanced` (from 10 000 Gaussians) and `max` also distil (`best`,
-        `.fgs`). Default: `balanced`.
-    best_effort : bool
-        If the target cannot be met, write the closest result. Default: raise `TargetError`.
-    unseen : str
-        What to do with Gaussians that no training view sees (`best`): `keep`, `drop`, or a share such as `20%`, which keeps
-        the most visible ones. Default: `keep`, without view-dependent colour.
-    views_margin : bool, optional
-        Bound the loss at made poses, where no camera stood, and score some too (`best`). Default: as `promise` says.
-    refit : bool
-        Refit colours after pruning and quantizing (`best`). Default: yes; without it files are larger.
-    distil : int, optional
-        Iterations that fine-tune the file against renders of the original, 0 for none (`best`, `.fgs`). Default: as the
-        effort says.
-    spz_version : {3, 4}
-        Version of a `.spz` that is written. Older programs read only 3. Default: 3.
-    recenter : bool
-        Move a scene that lies far from zero to zero, and write the offset beside the file (other programs' formats).
-    force_lossy : bool
-        Write a scene also where another program's format cannot hold its positions.
-    layers : int, optional
-        Write the file in 1 to 4 layers, between which `trim` can cut it (`best`). Default: 1.
-    preview : int, optional
-        Most bytes of a preview: the same scene in far fewer Gaussians, which viewers show until the first layer is there
-        (`best`); 0 for none. Default: 2 % of a file of a megabyte or more, if no target forbids them, and at most 262 144
-        Gaussians or three fifths of the scene are left; else 0.
-    scratch : str, optional
-        Folder for scratch files of scenes that do not fit into memory (`best`). Default: the folder of the output.
-    resume : bool
-        Keep each round of the search in the scratch folder until the run is done. Continue from the rounds of an interrupted
-        run (`best`).
-    cluster : str, optional
-        Draw views on Dask workers: the address of a scheduler, or `local:N` (`best`). Default: draw them here.
-    report : str, optional
-        Write a page about the run (index.html) and its record (result.json) to this folder.
-    dry_run : bool
-        Do all the work, but write no file.
-    force : bool
-        Overwrite existing files.
+    `max_size` and `preview` are bytes; `unseen` is a word or a share such as "20%"; `distil` counts iterations.
     """
 
     method: str = "best"

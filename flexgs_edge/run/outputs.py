@@ -17,25 +17,14 @@ from flexgs_edge.run.options import CompressOptions
 
 @dataclass(frozen=True)
 class Output:
-    """Where a compressed scene goes.
+    """Where a compressed scene goes."""
 
-    Parameters
-    ----------
-    path : Path or None
-        The file to write; `None` in a dry run.
-    format : Format or None
-        Another program's format; `None` for a `.fgs`.
-    offset : np.ndarray or None
-        [3] f64, how far the scene was moved to zero; `None` if it was not.
-    """
-
-    path: Path | None = None
-    format: Format | None = None
-    offset: np.ndarray | None = None
+    path: Path | None = None  # the file to write; `None` in a dry run
+    format: Format | None = None  # another program's format; `None` for a `.fgs`
+    offset: np.ndarray | None = None  # [3] f64, how far the scene was moved to zero; `None` if it was not
 
 
-NO_OUTPUT = Output()
-"""Of commands that write no scene."""
+NO_OUTPUT = Output()  # Of commands that write no scene
 
 
 def check_output(output: str | os.PathLike[str] | None, options: CompressOptions) -> Output:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import MadePoses, Promised
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import Figure, Target
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.options import CompressOptions
@@ -17,27 +17,15 @@ EVERYTHING = Choice(0, 0)
 
 @dataclass(frozen=True)
 class Plan:
-    """Views, target and scores of a run.
+    """Views, target and scores of a run."""
 
-    Parameters
-    ----------
-    decide : list of int
-        Views that decide when the search stops: the held-out views, or the training views with `--select train`.
-    report : list of int
-        Views that the final figures come from: the held-out views, or the training views if none are held out.
-    figure : str
-        The kind of drop that decides: `drop` against photos, else `modelled drop`.
-    target : Target or None
-        `None` for fixed rates.
-    needs_scores : bool
-        Whether the method computes importance scores.
-    """
-
+    # Views that decide when the search stops: the held-out views, or the training views with `--select train`.
     decide: list[int]
+    # Views that the final figures come from: the held-out views, or the training views if none are held out.
     report: list[int]
-    figure: Figure
-    target: Target | None
-    needs_scores: bool
+    figure: Figure  # the kind of drop that decides: `drop` against photos, else `modelled drop`
+    target: Target | None  # `None` for fixed rates
+    needs_scores: bool  # whether the method computes importance scores
 
     @classmethod
     def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:

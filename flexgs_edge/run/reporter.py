@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.goals.target import Target
@@ -21,13 +25,116 @@ from flexgs_edge.report.as_json import json_text
 from flexgs_edge.report.material import Live, Material, Rig, Shot
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
+from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_scene import is_fgs
-from flexgs_edge.run.pictures import draw_shots, rig_of, shots_bytes
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.scene.source import SceneSource
+
+MOST_SHOTS = 5
+"""A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
+MOST_WIDTH = 800  # Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most
+LAYERS = 5  # Pictures per view: original, compressed, error map, map of FLIP, photo
+PIXEL_BYTES = 1
+"""Bytes per pixel that we reserve for an encoded picture. Only noise takes more: docs/results/tuning.md#memory"""
+JPEG_QUALITY = 95
+"""High enough that pictures differ by our compression and not by JPEG: docs/results/tuning.md#jpeg_quality"""
+ERROR_QUALITY = 85
+MOST_POINTS = 1500  # The camera plans show the scene as at most this many of its Gaussians
+
+
+def shown_size(camera: Camera) -> tuple[int, int]:
+    """Width and height of a view's pictures."""
+    if camera.width <= MOST_WIDTH:
+        return camera.width, camera.height
+    return MOST_WIDTH, max(1, round(camera.height * MOST_WIDTH / camera.width))
+
+
+def shots_bytes(cameras: Sequence[Camera]) -> int:
+    """Bytes to reserve for the encoded pictures of a report on `cameras`."""
+    sizes = sorted((width * height for width, height in map(shown_size, cameras)), reverse=True)
+    return LAYERS * PIXEL_BYTES * sum(sizes[:MOST_SHOTS])
+
+
+def chosen_ranks(count: int) -> list[int]:
+    """Ranks of the views to show, counted from the worst view.
+
+    >>> chosen_ranks(10), chosen_ranks(2), chosen_ranks(0)
+    ([0, 2, 4, 6, 9], [0, 1], [])
+    """
+    most = min(count, MOST_SHOTS)
+    return [i * (count - 1) // max(most - 1, 1) for i in range(most)]
+
+
+def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
+    """Draw and encode the pictures of some views, the worst view first."""
+    order = quality.by_loss
+    ranks = chosen_ranks(len(order))
+    shots = []
+    for rank in progress.track(ranks, "drawing pictures", len(ranks)):
+        view = order[rank]
+        image, original, photo = judge.images(scene, view)
+        width, height = shown_size(judge.cameras[view])
+        shots.append(
+            Shot(
+                view=view,
+                camera=judge.indices[view],
+                rank=rank,
+                of=len(order),
+                width=width,
+                height=height,
+                original=encode(original, (width, height)),
+                compressed=encode(image, (width, height)),
+                error=encode_map(error_map(image, original), (width, height)),
+                flip=encode_map(np.minimum(judge.flip_map(image, original) / FLIP_SCALE, 1.0), (width, height)),
+                photo=None if photo is None else encode(photo, (width, height)),
+            )
+        )
+    return tuple(shots)
+
+
+def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY) -> bytes:
+    """Encode [H, W, 3] f32 in [0, 1] as JPEG, scaled down to `size` by area. Chroma keeps its full resolution."""
+    from PIL import Image
+
+    pixels = np.rint(np.clip(image, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    if picture.size != size:
+        picture = picture.resize(size, Image.Resampling.BOX)
+    out = io.BytesIO()
+    picture.save(out, "JPEG", quality=quality, subsampling=0)
+    return out.getvalue()
+
+
+def encode_map(errors: np.ndarray, size: tuple[int, int]) -> bytes:
+    """Encode a map of errors between two renders, [H, W] f32 from 0 to 1, as JPEG.
+
+    The map comes at full size and is scaled down here: averaging the pictures first would hide errors.
+    """
+    from PIL import Image
+
+    if errors.shape != size[::-1]:
+        errors = np.asarray(Image.fromarray(np.ascontiguousarray(errors)).resize(size, Image.Resampling.BOX))
+    return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
+
+
+def rig_of(views: ViewSet, source: SceneSource) -> Rig:
+    """Collect the camera poses, and some Gaussians at evenly spaced rows. The same scene gives the same Gaussians."""
+    cameras = views.cameras
+    rows = np.unique(np.linspace(0, source.count - 1, min(source.count, MOST_POINTS)).astype(np.int64))
+    means = source.read(rows, ["means"])["means"]
+    return Rig(
+        names=tuple(camera.name for camera in cameras),
+        centers=np.stack([camera.center for camera in cameras]),
+        rotations=np.stack([camera.rotation for camera in cameras]),
+        reach=np.array([(camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)) for camera in cameras]),
+        held_out=frozenset(views.held_out),
+        points=means.T.astype(np.float64) + source.origin,
+    )
+
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -37,17 +144,8 @@ PAGE, RECORD = "index.html", "result.json"
 class Reporter:
     """Collects the contents of a report during a run, and writes them at the end.
 
-    Parameters
-    ----------
-    folder : path
-        Created at the end if it does not exist. The constructor only checks that it can be written.
-    force : bool
-        Overwrite an earlier report.
-
-    Raises
-    ------
-    InputError
-        If the report cannot be written there.
+    `folder`: created at the end if it does not exist. The constructor only checks that it can be written. `force`:
+    overwrite an earlier report. Raises `InputError` if the report cannot be written there.
     """
 
     def __init__(self, folder: str | Path, force: bool) -> None:
@@ -126,10 +224,7 @@ class Reporter:
             except OSError as error:
                 raise InputError(f"--report {self.folder}: cannot make the folder ({error.strerror})") from error
             place = self.folder / PAGE
-            with (
-                atomic_write(self.folder / RECORD, self.force) as record,
-                atomic_write(place, self.force) as page,
-            ):
+            with atomic_write(self.folder / RECORD, self.force) as record, atomic_write(place, self.force) as page:
                 record.write(json_text(result.to_json()).encode())
                 # Flush the record before the page gets its name: on a full disk no page may stand without its record.
                 record.flush()

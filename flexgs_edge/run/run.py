@@ -29,45 +29,19 @@ from flexgs_edge.scene.source import SceneSource
 
 @dataclass(frozen=True)
 class Run(Generic[Options]):
-    """What was asked, and of what. Nothing in it changes.
+    """What was asked, and of what. Nothing in it changes."""
 
-    Parameters
-    ----------
-    options : ViewOptions
-        With near plane, background, extent and antialiasing filled in.
-    scene : CheckedScene
-        Checked.
-    views : ViewSet or None
-        `None` for `--cameras none`.
-    plan : Plan or None
-        What a run of `compress` needs; `None` for other commands.
-    budget : MemoryBudget
-        One number of bytes for all of it.
-    clock : Stopwatch
-        Seconds by stage.
-    progress : Progress
-        Bars on long work.
-    reporter : Reporter or None
-        Gathers the pages of `--report`.
-    output : Output
-        The file that `compress` writes.
-    judged : CheckedScene or None
-        The scene that is compared with this one (`evaluate`).
-    doubts : tuple of str
-        Warnings about how scene and cameras fit together; they are logged already.
-    """
-
-    options: Options
-    scene: CheckedScene
-    views: ViewSet | None
-    plan: Plan | None
-    budget: MemoryBudget
-    clock: Stopwatch
-    progress: Progress = SILENT
-    reporter: Reporter | None = None
-    output: Output = NO_OUTPUT
-    judged: CheckedScene | None = None
-    doubts: tuple[str, ...] = ()
+    options: Options  # with near plane, background, extent and antialiasing filled in
+    scene: CheckedScene  # checked
+    views: ViewSet | None  # `None` for `--cameras none`
+    plan: Plan | None  # what a run of `compress` needs; `None` for other commands
+    budget: MemoryBudget  # one number of bytes for all of it
+    clock: Stopwatch  # seconds by stage
+    progress: Progress = SILENT  # bars on long work
+    reporter: Reporter | None = None  # gathers the pages of `--report`
+    output: Output = NO_OUTPUT  # the file that `compress` writes
+    judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
+    doubts: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
 
     @property
     def source(self) -> SceneSource:
@@ -98,35 +72,20 @@ class Run(Generic[Options]):
 
 
 def open_run(
-    path: ScenePlace,
+    path: ScenePlace,  # a scene file or a model folder, or a scene that is open
     options: Options,
     progress: Progress = SILENT,
     reporter: Reporter | None = None,
-    photos: bool = True,
+    photos: bool = True,  # look for photos as well as for cameras
     judged_path: ScenePlace | None = None,
-    given: GivenViews | None = None,
-    decodes: bool = True,
+    given: GivenViews | None = None,  # cameras and photos from memory, instead of those that the options name
+    decodes: bool = True,  # the command decodes a `.fgs`; if not, nothing is read of it here either
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
 
-    Parameters
-    ----------
-    path : path or CheckedScene
-        A scene file or a model folder, or a scene that is open.
-    photos : bool
-        Look for photos as well as for cameras.
-    judged_path : path or CheckedScene, optional
-        A scene made from this one, which it is compared with. Both are drawn as its file says, and cameras beside it are
-        used where this one has none.
-    given : GivenViews, optional
-        Cameras and photos from memory, instead of those that the options name.
-    decodes : bool
-        The command decodes a `.fgs`. If not, nothing is read of it here either.
-
-    Raises
-    ------
-    InputError
-        When the scene, its cameras or its photos cannot be used.
+    `judged_path`: a scene made from this one, which it is compared with. Both are drawn as its file says, and cameras
+    beside it are used where this one has none. Raises `InputError` when the scene, its cameras or its photos cannot be
+    used.
     """
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(options.memory_limit)
@@ -170,10 +129,7 @@ def open_compression(
 
     `output`: The file to write; `None` in a dry run.
 
-    Raises
-    ------
-    InputError
-        When a file cannot be written or read, or the options do not fit together.
+    Raises `InputError` when a file cannot be written or read, or the options do not fit together.
     """
     place = check_output(output, options)
     reporter = Reporter.maybe(options.report, options.force)

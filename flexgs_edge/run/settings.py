@@ -6,15 +6,13 @@ from typing import Any
 
 from flexgs_edge._version import __version__
 from flexgs_edge.codec.header import canonical_json
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Covered, Measurement
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 
-MARGIN = 16
-"""Room for numbers of the header that grow by a digit with the settings, such as its own length."""
+MARGIN = 16  # Room for numbers of the header that grow by a digit with the settings, such as its own length
 
 
 def make_settings(
@@ -24,14 +22,8 @@ def make_settings(
 
     Every run and machine must store the same settings, so they hold no times, paths or devices.
 
-    Parameters
-    ----------
-    run : Run
-        Gives the options, the plan and the scene.
-    search : SearchResult or None
-        `None` for fixed rates.
-    bits : BitSpec, optional
-        Bits per attribute (`paper`).
+    `run`: gives the options, the plan and the scene. `search`: `None` for fixed rates. `bits`: bits per attribute
+    (`paper`).
     """
     options, plan, scene, views = run.options, run.plan, run.scene, run.views
     choice = search.chosen.choice if search else options.fixed

@@ -20,8 +20,7 @@ from flexgs_edge.run.inputs import LOG, Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
 
-MEMORY = "memory"
-"""Takes the place of a path in records when cameras or photos came from memory."""
+MEMORY = "memory"  # Takes the place of a path in records when cameras or photos came from memory
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 
@@ -29,35 +28,19 @@ WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for autom
 class ViewSet:
     """Views in order of name, and their split.
 
-    Parameters
-    ----------
-    cameras : list of Camera
-        In world coordinates, at the size they are drawn.
-    photos : Photos or None
-        One photo per camera.
-    train, held_out : list of int
-        Indices into `cameras`.
-    cameras_from : str
-        Path of the camera file, or `auto`.
-    images_path : Path or None
-        Folder of the photos.
-    notes : tuple of str
-        How automatic cameras were placed, and which views were scaled or lost their distortion.
-    near : float or None
-        Largest near plane that does not cut off what automatic views show, scene units.
-    fits_exposure : bool
-        Photos are fitted to the exposure of the original before they are compared.
+    `train`, `held_out`: indices into `cameras`.
     """
 
-    cameras: list[Camera]
-    photos: Photos | None
+    cameras: list[Camera]  # in world coordinates, at the size they are drawn
+    photos: Photos | None  # one photo per camera
     train: list[int]
     held_out: list[int]
-    cameras_from: str
-    images_path: Path | None
+    cameras_from: str  # path of the camera file, or `auto`
+    images_path: Path | None  # folder of the photos
+    # How automatic cameras were placed, and which views were scaled or lost their distortion.
     notes: tuple[str, ...] = ()
-    near: float | None = None
-    fits_exposure: bool = True
+    near: float | None = None  # largest near plane that does not cut off what automatic views show, scene units
+    fits_exposure: bool = True  # photos are fitted to the exposure of the original before they are compared
 
     def of(self, indices: Sequence[int]) -> list[Camera]:
         """The cameras at `indices`."""
@@ -66,20 +49,12 @@ class ViewSet:
 
 @dataclass(frozen=True)
 class GivenViews:
-    """Cameras and photos from memory instead of files.
+    """Cameras and photos from memory instead of files."""
 
-    Parameters
-    ----------
-    cameras : sequence of Camera, optional
-        Default: those that the options name, else those beside the scene.
-    images : sequence of np.ndarray, optional
-        [H, W, 3] or [H, W, 4] u8, one per camera, in the order of `cameras`. For cameras from a file: in order of name.
-    cameras_from : str
-        File that the cameras were read from, so that photos beside it are found. Default: unknown.
-    """
-
-    cameras: Sequence[Camera] | None = None
+    cameras: Sequence[Camera] | None = None  # default: those that the options name, else those beside the scene
+    # [H, W, 3] or [H, W, 4] u8, one per camera, in the order of `cameras`. For cameras from a file: in order of name.
     images: Sequence[np.ndarray] | None = None
+    # File that the cameras were read from, so that photos beside it are found. Default: unknown.
     cameras_from: str = MEMORY
 
     def in_order_of_name(self) -> GivenViews:
@@ -95,36 +70,15 @@ class GivenViews:
 
 
 def find_views(
-    options: ViewOptions,
-    companions: Companions,
-    source: SceneSource,
-    with_photos: bool = True,
-    given: GivenViews | None = None,
+    options: ViewOptions,  # its background must be filled in: photos with an alpha channel are blended with it
+    companions: Companions,  # cameras and photos beside the scene
+    source: SceneSource,  # the scene, from which automatic cameras are placed
+    with_photos: bool = True,  # Also open the photos. Default: yes.
+    given: GivenViews | None = None,  # Cameras and photos from memory. They go before options and files.
 ) -> ViewSet | None:
     """Find the views of a run: from memory, from the options, beside the scene, or else generated.
 
-    Parameters
-    ----------
-    options : ViewOptions
-        Its background must be filled in: photos with an alpha channel are blended with it.
-    companions : Companions
-        Cameras and photos beside the scene.
-    source : SceneSource
-        The scene, from which automatic cameras are placed.
-    with_photos : bool
-        Also open the photos. Default: yes.
-    given : GivenViews, optional
-        Cameras and photos from memory. They go before options and files.
-
-    Returns
-    -------
-    ViewSet or None
-        `None` for `--cameras none`.
-
-    Raises
-    ------
-    InputError
-        If cameras or photos cannot be read or do not match.
+    Returns `None` for `--cameras none`. Raises `InputError` if cameras or photos cannot be read or do not match.
     """
     given = given or GivenViews()
     place = options.cameras or companions.cameras or AUTO_CAMERAS

@@ -13,8 +13,7 @@ from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 
 LOG = logging.getLogger("flexgs_edge")
-TELLING_ROWS = 32
-"""In scenes of fewer Gaussians, all opacities and scales may look activated by chance."""
+TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
 """Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is
@@ -46,16 +45,9 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     splats) are valid: they are read as the smallest finite log-scale of the scene. Logits of +-inf (opacities 1 and 0)
     are valid too: they are read as +-`OPACITY_LIMIT`.
 
-    Returns
-    -------
-    SceneSource
-        `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped. A scene whose
-        opacities and scales look activated is warned of.
-
-    Raises
-    ------
-    InputError
-        If the scene is empty or has invalid rows. The message tells how many, in which fields, and the first row.
+    Returns `source` itself, or a lazy source over it, with a note on the rows that were left out or clamped. A scene
+    whose opacities and scales look activated is warned of. Raises `InputError` if the scene is empty or has invalid
+    rows. The message tells how many, in which fields, and the first row.
     """
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: it has no Gaussians")

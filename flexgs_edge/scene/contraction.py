@@ -14,28 +14,18 @@ from typing import Any
 
 import numpy as np
 
-OCTAVES = 64
-"""Most doublings; what lies beyond is not contracted further."""
+OCTAVES = 64  # Most doublings; what lies beyond is not contracted further
 LARGEST = 2.0**126
 """Largest magnitude of coordinates that can be coded, and of radii and their reciprocals: nothing leaves float32 or float64."""
-_SAMPLE, _FEWEST = 4096, 32
-"""Rows that tell the centre, and rows of its densest part."""
+_SAMPLE, _FEWEST = 4096, 32  # Rows that tell the centre, and rows of its densest part
 
 
 @dataclass(frozen=True)
 class Contraction:
-    """A contraction of positions.
+    """A contraction of positions."""
 
-    Parameters
-    ----------
-    centre : tuple of float
-        Relative to the scene's origin.
-    radius : float
-        Positions within it stay as they are.
-    """
-
-    centre: tuple[float, float, float]
-    radius: float
+    centre: tuple[float, float, float]  # relative to the scene's origin
+    radius: float  # positions within it stay as they are
 
     def contract(self, means: np.ndarray) -> np.ndarray:
         """[3, n] f64, contracted positions."""

@@ -7,24 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Field:
-    """One attribute of a Gaussian.
+    """One attribute of a Gaussian."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the field in our arrays and files.
-    space : str
-        Meaning of the stored numbers, such as a logarithm.
-    ply : tuple of str
-        Names of INRIA's PLY properties, one a channel (for `sh_rest` a prefix: see `ply_names`).
-    bits : str
-        Name in `--bits` and in the container.
-    """
-
-    name: str
-    space: str
-    ply: tuple[str, ...]
-    bits: str
+    name: str  # name of the field in our arrays and files
+    space: str  # meaning of the stored numbers, such as a logarithm
+    ply: tuple[str, ...]  # names of INRIA's PLY properties, one a channel (for `sh_rest` a prefix: see `ply_names`)
+    bits: str  # name in `--bits` and in the container
 
     def width(self, sh_degree: int) -> int:
         """Number of channels in a scene with this SH degree."""
@@ -60,7 +48,6 @@ FIELDS: tuple[Field, ...] = (
         "log_scales", "natural log of the standard deviations, scene units", ("scale_0", "scale_1", "scale_2"), "scale"
     ),
     Field("quats", "rotation quaternion w x y z, any norm", ("rot_0", "rot_1", "rot_2", "rot_3"), "rot"),
-)
-"""All fields, in the order of INRIA's PLY."""
+)  # All fields, in the order of INRIA's PLY
 
 FIELD: dict[str, Field] = {field.name: field for field in FIELDS}

@@ -15,17 +15,8 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
     scales follow. The largest |w| among the 24 forms is the largest of three numbers: the largest component, the sum of
     the two largest over sqrt(2), and the sum of all four over 2. We use float64, basic operations and sqrt only.
 
-    Parameters
-    ----------
-    quats : np.ndarray
-        [4, n], w x y z, any norm but zero.
-    log_scales : np.ndarray
-        [3, n].
-
-    Returns
-    -------
-    tuple of np.ndarray
-        Unit quaternions [4, n] f64 with w >= |x|, |y|, |z|, and their log-scales [3, n] in the input's dtype.
+    `quats`: [4, n], w x y z, any norm but zero. `log_scales`: [3, n]. Returns unit quaternions [4, n] f64 with w >=
+    |x|, |y|, |z|, and their log-scales [3, n] in the input's dtype.
     """
     wide = np.asarray(quats, np.float64)
     largest = np.abs(wide).max(axis=0, initial=0)
@@ -144,15 +135,7 @@ def normalize_quats(quats: np.ndarray) -> np.ndarray:
 
     q / sqrt((w^2 + x^2) + (y^2 + z^2)) in float64, with all four signs changed if w < 0, rounded to float32 once.
 
-    Parameters
-    ----------
-    quats : np.ndarray
-        [4, n] f32, w x y z, none of them zero.
-
-    Returns
-    -------
-    np.ndarray
-        [4, n] f32.
+    `quats`: [4, n] f32, w x y z, none of them zero. Returns [4, n] f32.
     """
     wide = quats.astype(np.float64)
     square = wide * wide

@@ -15,11 +15,9 @@ from flexgs_edge.memory.rows import BLOCK_ROWS, copy_all_rows, put_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 
-Planes = dict[str, np.ndarray]
-"""Arrays by field name, each [width, n] f32."""
+Planes = dict[str, np.ndarray]  # Arrays by field name, each [width, n] f32
 
-Rows = slice | np.ndarray
-"""`slice(start, stop)`, or a sorted int64 array."""
+Rows = slice | np.ndarray  # `slice(start, stop)`, or a sorted int64 array
 
 _TURN_ROWS = 1024
 """Rows transposed at a time: 250 kB at SH degree 3. The columns of a whole chunk would not stay in the processor's
@@ -30,93 +28,41 @@ REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in r
 
 
 class SceneSource(ABC):
-    """N Gaussians that can be read in parts.
+    """N Gaussians that can be read in parts."""
 
-    Attributes
-    ----------
-    name : str
-        For messages: a path or "memory".
-    count : int
-        N.
-    sh_degree : int
-        0 to 4.
-    sh_count : int
-        Only rows [0, sh_count) may have SH above degree 0; those of other rows are zero. 0 at degree 0.
-    origin : np.ndarray
-        [3] f64, world: positions are relative to it.
-    notes : tuple of str
-        Notes of the reader on values that it left out or changed, for the summary.
-    valid : bool
-        All rows are known to pass `check_scene`, which then need not read them.
-    comments : tuple of str
-        Comments of this program in the header of a PLY, such as the step sizes of the values' grid.
-    settings : mapping
-        What the file states: how a `.fgs` was made, and how a scene is drawn (`antialiased`).
-    held_bytes : int
-        Bytes of the file's packed values in memory, as long as the source lives.
-    file_bytes : int or None
-        Bytes of all files that the scene was read from, if there are several. `None`: the size of its only file.
-    version : int or None
-        Version of the format that the file states.
-    whole : int or None
-        Gaussians of the scene that a cut file is a part of.
-    """
-
-    name: str
-    count: int
-    sh_degree: int
-    sh_count: int
-    origin: np.ndarray
-    notes: tuple[str, ...] = ()
-    valid: bool = False
+    name: str  # for messages: a path or "memory"
+    count: int  # N
+    sh_degree: int  # 0 to 4
+    sh_count: int  # Only rows [0, sh_count) may have SH above degree 0; those of other rows are zero. 0 at degree 0.
+    origin: np.ndarray  # [3] f64, world: positions are relative to it
+    notes: tuple[str, ...] = ()  # notes of the reader on values that it left out or changed, for the summary
+    valid: bool = False  # all rows are known to pass `check_scene`, which then need not read them
+    # Comments of this program in the header of a PLY, such as the step sizes of the values' grid.
     comments: tuple[str, ...] = ()
+    # What the file states: how a `.fgs` was made, and how a scene is drawn (`antialiased`).
     settings: Mapping[str, Any] = MappingProxyType({})
-    held_bytes: int = 0
+    held_bytes: int = 0  # bytes of the file's packed values in memory, as long as the source lives
+    # Bytes of all files that the scene was read from, if there are several. `None`: the size of its only file.
     file_bytes: int | None = None
-    version: int | None = None
-    whole: int | None = None
+    version: int | None = None  # version of the format that the file states
+    whole: int | None = None  # Gaussians of the scene that a cut file is a part of
 
     @abstractmethod
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """Read some fields of some rows.
 
-        Parameters
-        ----------
-        rows : slice or np.ndarray
-            `slice(start, stop)` without a step, or [n] int64, sorted ascending.
-        fields : sequence of str
-            Names from `flexgs_edge.scene.fields.FIELD`.
-        out : dict, optional
-            Arrays [width, n] f32 to fill; a field without one gets a new array.
-
-        Returns
-        -------
-        dict
-            {field: [width, n] f32}, with the arrays of `out` themselves if given.
-
-        Raises
-        ------
-        IndexError
-            If a row is outside [0, N).
-        ValueError
-            If a field is unknown, or an array of `out` does not fit.
+        `rows`: `slice(start, stop)` without a step, or [n] int64, sorted ascending. `fields`: names from
+        `flexgs_edge.scene.fields.FIELD`. `out`: arrays [width, n] f32 to fill; a field without one gets a new array.
+        Returns {field: [width, n] f32}, with the arrays of `out` themselves if given. Raises `IndexError` if a row is
+        outside [0, N). Raises `ValueError` if a field is unknown, or an array of `out` does not fit.
         """
 
     def read_table(self, rows: slice, out: np.ndarray) -> np.ndarray:
         """Read all fields of some rows in the layout of INRIA's PLY, row by row.
 
-        Parameters
-        ----------
-        rows : slice
-            `slice(start, stop)` without a step.
-        out : np.ndarray
-            [at least n, columns] f32, with zeros in columns 3 to 5; it may be filled.
-
-        Returns
-        -------
-        np.ndarray
-            [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals), the other fields in
-            the order of `FIELDS`. It is the first rows of `out`, or an array of the source.
+        `rows`: `slice(start, stop)` without a step. `out`: [at least n, columns] f32, with zeros in columns 3 to 5; it
+        may be filled. Returns [n, columns] f32, C-contiguous, valid until the next call: means, three zeros (normals),
+        the other fields in the order of `FIELDS`. It is the first rows of `out`, or an array of the source.
         """
         planes = self.read(rows, [field.name for field in FIELDS])
         part = out[: rows.stop - rows.start]
@@ -145,12 +91,8 @@ class SceneSource(ABC):
     def begin_read(self, rows: Rows, fields: Sequence[str], out: Planes | None) -> tuple[Rows, Planes]:
         """Check the arguments of `read`, and allocate the arrays that `out` lacks. Readers of formats call this first.
 
-        Returns
-        -------
-        rows : slice or np.ndarray
-            A slice with 0 <= start <= stop <= N, or int64.
-        planes : dict
-            One array [width, n] f32 a field, in the order of `fields`.
+        Returns `rows`: A slice with 0 <= start <= stop <= N, or int64. `planes`: One array [width, n] f32 a field, in
+        the order of `fields`.
         """
         rows, size = normalize_rows(rows, self.count)
         if isinstance(rows, np.ndarray):
@@ -212,32 +154,18 @@ def read_all(source: SceneSource, storage: Storage) -> Planes:
 class MemorySource(SceneSource):
     """A scene whose arrays are in memory.
 
-    Parameters
-    ----------
-    arrays : mapping
-        {field: [width, N] f32}; every field of the table. `sh_rest` ([0, N]) may be missing at degree 0.
-        C-contiguous float32 arrays are used as they are, never copied or changed.
-    sh_degree : int, optional
-        By default, it follows from the width of `sh_rest`.
-    origin : array_like, optional
-        [3] f64, world; zeros by default.
-    name : str, optional
-        For messages.
-    sh_count : int, optional
-        Rows from here on have no SH above degree 0, and zeros in their place. By default N, or 0 at degree 0.
-
-    Raises
-    ------
-    InputError
-        If a field is missing, unknown or of the wrong shape.
+    `arrays`: {field: [width, N] f32}; every field of the table. `sh_rest` ([0, N]) may be missing at degree 0.
+    C-contiguous float32 arrays are used as they are, never copied or changed. `sh_count`: rows from here on have no SH
+    above degree 0, and zeros in their place. By default N, or 0 at degree 0. Raises `InputError` if a field is missing,
+    unknown or of the wrong shape.
     """
 
     def __init__(
         self,
         arrays: Mapping[str, np.ndarray],
-        sh_degree: int | None = None,
-        origin: np.ndarray | Sequence[float] | None = None,
-        name: str = "memory",
+        sh_degree: int | None = None,  # by default, it follows from the width of `sh_rest`
+        origin: np.ndarray | Sequence[float] | None = None,  # [3] f64, world; zeros by default
+        name: str = "memory",  # for messages
         sh_count: int | None = None,
     ) -> None:
         self.name = name
@@ -301,14 +229,8 @@ class MemorySource(SceneSource):
 class SelectSource(SceneSource):
     """Some rows of another source, in the given order. A selection of a selection reads the first source.
 
-    Parameters
-    ----------
-    parent : SceneSource
-        The source of the values.
-    rows : np.ndarray
-        [n] integers in [0, parent.count), in any order, repeats allowed.
-    notes : tuple of str, optional
-        Added to the parent's notes.
+    `parent`: the source of the values. `rows`: [n] integers in [0, parent.count), in any order, repeats allowed.
+    `notes`: added to the parent's notes.
     """
 
     def __init__(self, parent: SceneSource, rows: np.ndarray, notes: tuple[str, ...] = ()) -> None:
@@ -345,17 +267,8 @@ class SelectSource(SceneSource):
 def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]]:
     """Cut a slice or a sorted list of rows at the chunks.
 
-    Parameters
-    ----------
-    rows : slice or np.ndarray
-        As `SceneSource.begin_read` gives them.
-    starts : np.ndarray
-        [c] i64, the first row of every chunk.
-
-    Yields
-    ------
-    tuple
-        The number of the chunk, the rows in it, and their place in the output.
+    `rows`: as `SceneSource.begin_read` gives them. `starts`: [c] i64, the first row of every chunk. Yields the number
+    of the chunk, the rows in it, and their place in the output.
     """
     if isinstance(rows, slice):
         at = rows.start
@@ -372,3 +285,13 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
     cuts = np.flatnonzero(np.diff(chunks, prepend=-1))
     for start, stop in zip(cuts.tolist(), [*cuts[1:].tolist(), len(rows)], strict=True):
         yield int(chunks[start]), rows[start:stop], slice(start, stop)
+
+
+SAMPLE_ROWS = 4096  # Most Gaussians whose positions tell which poses see which part of a scene, and how much of it
+
+
+def some_positions(source: SceneSource, most: int = SAMPLE_ROWS) -> np.ndarray:
+    """[3, n] f64, world coordinates of at most `most` rows, evenly spread over the scene's rows."""
+    rows = np.arange(0, source.count, max(-(-source.count // most), 1))
+    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+    return positions

@@ -8,10 +8,8 @@ from flexgs_edge.constants import MAX_SH_DEGREE, SH_C1, SH_C2, SH_C3, SH_C4
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.small_matrices import product
 
-_DIRECTIONS = 60
-"""Directions in which functions are compared: many more than the 9 functions of the widest band."""
-_DIGITS = 13
-"""Decimals of the matrices. Digits beyond them differ between processors."""
+_DIRECTIONS = 60  # Directions in which functions are compared: many more than the 9 functions of the widest band
+_DIGITS = 13  # Decimals of the matrices. Digits beyond them differ between processors.
 
 
 def sh_functions(degree: int, directions: np.ndarray) -> np.ndarray:
@@ -48,10 +46,7 @@ def band_matrices(turn: np.ndarray, degree: int = MAX_SH_DEGREE) -> list[np.ndar
 
     `turn`: [3, 3] f64, orthogonal; mirrors are allowed.
 
-    Returns
-    -------
-    list of np.ndarray
-        [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
+    Returns [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
     """
     directions = _spread(_DIRECTIONS)
     before, after = sh_functions(degree, product(turn.T, directions)), sh_functions(degree, directions)

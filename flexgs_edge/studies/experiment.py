@@ -20,36 +20,16 @@ class Beside:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment on one scene.
+    """One experiment on one scene."""
 
-    Parameters
-    ----------
-    key : str
-        Name of its files, without suffix.
-    title : str
-        Title on the page.
-    question : str
-        What was done, and what columns mean if their heads do not say it.
-    table : Table
-        The measurements.
-    chart : Chart
-        A chart of the table's rows.
-    findings : tuple of str
-        Sentences made from the table's numbers.
-    beside : tuple of Beside
-        Figures of the FlexGaussian paper, if it gives some.
-    timed : bool
-        Whether the table holds times, so that it differs from run to run.
-    """
-
-    key: str
-    title: str
-    question: str
-    table: Table
-    chart: Chart
-    findings: tuple[str, ...]
-    beside: tuple[Beside, ...] = ()
-    timed: bool = False
+    key: str  # name of its files, without suffix
+    title: str  # title on the page
+    question: str  # what was done, and what columns mean if their heads do not say it
+    table: Table  # the measurements
+    chart: Chart  # a chart of the table's rows
+    findings: tuple[str, ...]  # sentences made from the table's numbers
+    beside: tuple[Beside, ...] = ()  # figures of the FlexGaussian paper, if it gives some
+    timed: bool = False  # whether the table holds times, so that it differs from run to run
 
     def to_json(self) -> dict[str, Any]:
         """The record for programs."""

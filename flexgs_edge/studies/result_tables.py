@@ -17,18 +17,10 @@ Row = Mapping[str, Cell]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Parameters
-    ----------
-    name : str
-        Key in the rows, in CSV and in JSON.
-    head : str
-        Head on the page, with the unit.
-    """
-
-    name: str
-    head: str
+    name: str  # key in the rows, in CSV and in JSON
+    head: str  # head on the page, with the unit
 
 
 @dataclass(frozen=True)

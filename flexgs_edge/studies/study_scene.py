@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
@@ -34,8 +33,7 @@ from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
 
-RANK_BYTES = 24
-"""Bytes for each row and score: order, rank, and the number of rows with SH above each rank."""
+RANK_BYTES = 24  # Bytes for each row and score: order, rank, and the number of rows with SH above each rank
 
 
 @dataclass(frozen=True)
@@ -58,32 +56,16 @@ class Point:
 
 
 class StudyScene:
-    """A scene, its judge and everything measured so far.
-
-    Parameters
-    ----------
-    name : str
-        Name of the scene, for tables and folders.
-    run : Run
-        As for `compress`. The plan's views and figure decide here too.
-    bench : Bench
-        Draws the views.
-    judge : Judge
-        Prepared, with the original's renders.
-    orders : dict
-        [N] i64 by name of the score: rows, least important first.
-    has_sh : np.ndarray
-        [N] bool, rows with SH that are not zero.
-    """
+    """A scene, its judge and everything measured so far."""
 
     def __init__(
         self,
-        name: str,
-        run: Run[CompressOptions],
-        bench: Bench,
-        judge: Judge,
-        orders: dict[str, np.ndarray],
-        has_sh: np.ndarray,
+        name: str,  # name of the scene, for tables and folders
+        run: Run[CompressOptions],  # As for `compress`. The plan's views and figure decide here too.
+        bench: Bench,  # draws the views
+        judge: Judge,  # prepared, with the original's renders
+        orders: dict[str, np.ndarray],  # [N] i64 by name of the score: rows, least important first
+        has_sh: np.ndarray,  # [N] bool, rows with SH that are not zero
     ) -> None:
         self.name, self.run, self.bench, self.judge, self.orders, self.has_sh = name, run, bench, judge, orders, has_sh
         self._evaluators: dict[str, SceneEvaluator] = {}
@@ -187,8 +169,7 @@ FIGURES = {
     "drop": "drop (dB)",
     "fidelity": "fidelity (dB)",
     "modelled_drop": "modelled drop (dB)",
-}
-"""Columns at the end of every measured row, and their heads."""
+}  # Columns at the end of every measured row, and their heads
 
 
 class _Remembering:
@@ -213,10 +194,7 @@ def open_study_scene(
 ) -> Iterator[StudyScene]:
     """Open a scene, draw the original's renders and score every Gaussian, as `compress --method paper` does.
 
-    Raises
-    ------
-    FlexGSError
-        As `compress`.
+    Raises `FlexGSError`: As `compress`.
     """
     # Studies compare methods by the mean alone, each with the poses that it is given.
     options = replace(options, promise="mean")

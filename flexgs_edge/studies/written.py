@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from flexgs_edge._version import __version__
-from flexgs_edge.report.plots import picture
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.report.html import render
+from flexgs_edge.report.plots import picture, require_matplotlib
+from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, fields_json, record
 from flexgs_edge.report.summary import device_words
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info
 from flexgs_edge.run.view_set import views_info
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.page import Section
 from flexgs_edge.studies.result_tables import json_bytes
 from flexgs_edge.studies.study_scene import StudyScene
+
+LOG = logging.getLogger("flexgs_edge")
+
+
+@dataclass(frozen=True)
+class Section:
+    """The part of the page about one scene: its name, facts about it, and its experiments with their charts as SVG."""
+
+    name: str
+    facts: Sequence[tuple[str, str]]
+    experiments: Sequence[tuple[Experiment, bytes]]
 
 
 @dataclass(frozen=True)
@@ -45,14 +58,7 @@ class SceneStudy:
 
     def to_json(self) -> dict[str, Any]:
         """The record for machines."""
-        return {
-            "name": self.name,
-            "input": self.scene.to_json(),
-            "views": self.views.to_json(),
-            "decided_by": self.decided_by,
-            "experiments": [experiment.to_json() for experiment in self.experiments],
-            "run": self.run.to_json(),
-        }
+        return fields_json(self)
 
     def to_lines(self) -> list[str]:
         """The findings, for people."""
@@ -66,33 +72,40 @@ class SceneStudy:
 
 @dataclass(frozen=True)
 class WrittenStudy:
-    """The results of a study of one scene, and their folder.
+    """The results of a study of one scene, and their folder."""
 
-    Parameters
-    ----------
-    output : str
-        The folder.
-    scene : SceneStudy
-        The results.
-    """
-
-    output: str
-    scene: SceneStudy
+    output: str  # the folder
+    scene: SceneStudy  # the results
 
     command: ClassVar[str]
 
     def to_json(self) -> dict[str, Any]:
         """The record for machines."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": self.command,
-            "output": self.output,
-            **self.scene.to_json(),
-        }
+        return record(self.command, self, "scene", **self.scene.to_json())
 
     def to_text(self) -> str:
         """The findings, for people."""
         return "\n".join([*self.scene.to_lines(), f"wrote {os.path.join(self.output, 'index.html')}"]) + "\n"
+
+
+def write_page(folder: Path, title: str, intro: str, sections: Sequence[Section]) -> None:
+    """Write the page of a study into its folder."""
+    page = render("study.html", title=title, intro=intro, sections=sections)
+    (folder / "index.html").write_text(page, encoding="utf-8")
+
+
+def write_study(
+    output: str | os.PathLike[str], force: bool, title: str, intro: str, make: Callable[[Path], SceneStudy]
+) -> SceneStudy:
+    """Write the results that `make` returns to a folder, which appears when all is done."""
+    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
+    require_matplotlib()
+    check_folder(output, force)
+    with atomic_folder(output, force) as folder:
+        found = make(folder)
+        write_page(folder, title, intro, [write_scene(folder, found)])
+    LOG.info("wrote %s", os.path.join(output, "index.html"))
+    return found
 
 
 def write_scene(place: Path, scene: SceneStudy) -> Section:

@@ -10,8 +10,7 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
-LIVE = {**ENTRIES, "page": "viewer/src/live.js"}
-"""The same for the live scenes of a report."""
+LIVE = {**ENTRIES, "page": "viewer/src/live.js"}  # The same for the live scenes of a report
 PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
 """Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
 viewer asks for the chunks in sight first."""
@@ -19,8 +18,7 @@ _KINDS = {
     PLAIN: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     SPATIAL: ("viewer/src/spatial-worker.js", "viewer/src/scene-viewer-spatial.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
-}
-"""Of each kind, the worker that loads, and the module with the viewer."""
+}  # Of each kind, the worker that loads, and the module with the viewer
 _FORMATS = "decoder/src/formats.js"
 _FORMATS_2 = "decoder/src/formats2.js"
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
@@ -43,13 +41,8 @@ def entries_of(kind: str) -> dict[str, str]:
 def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
     """Texts of all files that the viewer needs, by their path below `web/`.
 
-    Parameters
-    ----------
-    version : int
-        Container version of the scene. A page of a scene of version 2 reads no other files, so that it is short; one of a
-        scene of version 1 reads both.
-    kind : str
-        Kind of the scene.
+    `version`: container version of the scene. A page of a scene of version 2 reads no other files, so that it is short;
+    one of a scene of version 1 reads both. `kind`: kind of the scene.
     """
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]

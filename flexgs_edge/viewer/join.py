@@ -8,8 +8,35 @@ from __future__ import annotations
 import posixpath
 import re
 from collections.abc import Mapping
+from importlib.util import find_spec
 
-from flexgs_edge.viewer.shorten import shorten_script
+_SHADER = re.compile(r"`#version[^`]*`")
+
+
+def shorten_script(text: str) -> str:
+    """A script of JavaScript that does the same; shaders in it lose comments and spaces."""
+    return _shorten("application/javascript", _SHADER.sub(lambda found: _shorten_shader(found[0]), text))
+
+
+def shorten_style(text: str) -> str:
+    """A style that says the same."""
+    return _shorten("text/css", text)
+
+
+def _shorten(kind: str, text: str) -> str:
+    # For some machines there is no wheel (Apple's processors, November 2026). Pages are longer there, and work as well.
+    if find_spec("minify") is None:
+        return text
+    import minify  # a runtime of its own, which only pages need
+
+    return str(minify.string(kind, text))
+
+
+def _shorten_shader(text: str) -> str:
+    """Without comments, indentation and spaces beside signs; not beside + and -, two of which would become another sign."""
+    lines = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
+    return re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", lines)
+
 
 _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
 _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
@@ -25,17 +52,8 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     modules but the entries share one scope, since that makes the script shorter: no two of them may have one name at their
     top, and none may import under another name.
 
-    Parameters
-    ----------
-    files : mapping
-        Texts by path.
-    entries : mapping
-        Paths of the modules to run, by name.
-
-    Raises
-    ------
-    ValueError
-        For an import, export or name of a form that is not understood, and for a name that two modules have.
+    `files`: texts by path. `entries`: paths of the modules to run, by name. Raises `ValueError` for an import, export
+    or name of a form that is not understood, and for a name that two modules have.
     """
     parts: dict[str, str] = {}
     for path in entries.values():

@@ -11,8 +11,7 @@ from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.viewer.assets import PAGE, PLAIN, STYLE, entries_of
-from flexgs_edge.viewer.join import join_modules
-from flexgs_edge.viewer.shorten import shorten_style
+from flexgs_edge.viewer.join import join_modules, shorten_style
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'
@@ -25,16 +24,8 @@ def page_config(
 ) -> dict[str, Any]:
     """What the page is told of its scene.
 
-    Parameters
-    ----------
-    name : str
-        Shown on the page.
-    cameras : sequence of Camera
-        The poses to choose from.
-    look : mapping
-        How it is drawn: `near`, `background`, `antialiased`.
-    scene : str, optional
-        Address of the file; left out if its bytes lie in the page.
+    `name`: shown on the page. `cameras`: the poses to choose from. `look`: how it is drawn: `near`, `background`,
+    `antialiased`. `scene`: address of the file; left out if its bytes lie in the page.
     """
     config = {"name": name, "poses": [_pose(camera) for camera in cameras], "look": dict(look)}
     return config if scene is None else {**config, "scene": scene}
@@ -54,17 +45,10 @@ def _short(value: float) -> float:
 
 @dataclass(frozen=True)
 class Page:
-    """A page of one file.
-
-    Parameters
-    ----------
-    text : str
-    policy : str
-        What the page may load and run, for a header or an element of its own.
-    """
+    """A page of one file."""
 
     text: str
-    policy: str
+    policy: str  # what the page may load and run, for a header or an element of its own
 
 
 def viewer_page(
@@ -75,16 +59,8 @@ def viewer_page(
     With one request, everything but the scene is there. Workers run the page's own script. The policy lets only the page's
     own script and style in, by their checksums.
 
-    Parameters
-    ----------
-    files : mapping
-        Texts of the viewer by path.
-    config : mapping
-        From `page_config`.
-    scene : bytes, optional
-        A `.fgs` to put into the page, which then opens from disk without a network.
-    kind : str
-        As for `web_files`.
+    `files`: texts of the viewer by path. `config`: from `page_config`. `scene`: a `.fgs` to put into the page, which
+    then opens from disk without a network. `kind`: as for `web_files`.
     """
     script = join_modules(files, entries_of(kind))
     if "</script" in script.lower() or "<!--" in script:

@@ -23,12 +23,9 @@ from typing import Any
 
 from flexgs_edge.errors import InputError
 
-HEAD_MOST = 16384
-"""Most bytes of a request; browsers send less than one kilobyte."""
-HEAD_SECONDS = 10.0
-"""Time for a request to come."""
-SEND_SECONDS = 30.0
-"""Time for a piece of an answer to go."""
+HEAD_MOST = 16384  # Most bytes of a request; browsers send less than one kilobyte
+HEAD_SECONDS = 10.0  # Time for a request to come
+SEND_SECONDS = 30.0  # Time for a piece of an answer to go
 CONNECTIONS_MOST = 64
 _PIECE = 1 << 16
 _REQUEST = re.compile(r"([A-Z]{1,16}) (\S{1,2048}) HTTP/1\.[01]")
@@ -47,41 +44,20 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Resource:
-    """What lies at a path: bytes, or a file that is read when it is asked for.
+    """What lies at a path: bytes, or a file that is read when it is asked for."""
 
-    Parameters
-    ----------
-    kind : str
-        Content type.
-    content : bytes or Path
-    packed : bytes, optional
-        The content packed with gzip, for those who take it. A scene has none: it is packed already.
-    policy : str, optional
-        What a page may load and run. Default: nothing.
-    """
-
-    kind: str
+    kind: str  # content type
     content: bytes | Path
+    # The content packed with gzip, for those who take it. A scene has none: it is packed already.
     packed: bytes | None = None
-    policy: str | None = None
+    policy: str | None = None  # What a page may load and run. Default: nothing.
 
 
 class SceneServer:
     """A server of a fixed set of resources.
 
-    Parameters
-    ----------
-    resources : mapping
-        Resources by their path, without a leading slash.
-    host : str
-        Address to listen at.
-    port : int
-        0 for any that is free.
-
-    Raises
-    ------
-    InputError
-        If the address cannot be used.
+    `resources`: resources by their path, without a leading slash. `host`: address to listen at. `port`: 0 for any that
+    is free. Raises `InputError` if the address cannot be used.
     """
 
     def __init__(self, resources: Mapping[str, Resource], host: str = "127.0.0.1", port: int = 0) -> None:

@@ -15,17 +15,10 @@ from flexgs_edge.views.cluster import Cluster
 
 @dataclass
 class Bench:
-    """Draws the views of a run; a context manager that closes the cluster and the backend.
+    """Draws the views of a run; a context manager that closes the cluster and the backend."""
 
-    Parameters
-    ----------
-    renderer : Renderer
-        Owns the backend and the budget.
-    cluster : Cluster or None
-        Draws the views of `ViewSums.draw` and `images` in the renderer's stead, once it has workers.
-    """
-
-    renderer: Renderer
+    renderer: Renderer  # owns the backend and the budget
+    # Draws the views of `ViewSums.draw` and `images` in the renderer's stead, once it has workers.
     cluster: Cluster | None = None
 
     @property

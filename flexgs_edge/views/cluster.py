@@ -30,10 +30,8 @@ from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, warm_up, w
 
 LOG = logging.getLogger("flexgs_edge")
 
-AHEAD = 2
-"""Views asked for ahead, for each worker; their sums wait in the memory of the workers."""
-SENDINGS = 3
-"""How many times a scene is sent before we give up, if all workers that held it were lost."""
+AHEAD = 2  # Views asked for ahead, for each worker; their sums wait in the memory of the workers
+SENDINGS = 3  # How many times a scene is sent before we give up, if all workers that held it were lost
 CONNECT_SECONDS = 30
 NICE = 10
 """Niceness of the worker processes that we start on this machine, so that the main process keeps a core:
@@ -45,18 +43,9 @@ class Cluster:
 
     Worker processes on this machine take seconds to start. Until then, the caller draws the views itself.
 
-    Parameters
-    ----------
-    address : str
-        Address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes on this
-        machine.
-    drawing : Drawing
-        How workers draw.
-
-    Raises
-    ------
-    InputError
-        If the package is missing, the address is wrong, nobody answers, or workers run another version of this program.
+    `address`: address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes
+    on this machine. `drawing`: how workers draw. Raises `InputError` if the package is missing, the address is wrong,
+    nobody answers, or workers run another version of this program.
     """
 
     _starting: Future[None] | None = None

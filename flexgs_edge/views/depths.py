@@ -14,8 +14,7 @@ from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.small_matrices import product
 
-MIDDLE = 3
-"""A camera looks at the middle one of so many parts of its frame, across and down."""
+MIDDLE = 3  # A camera looks at the middle one of so many parts of its frame, across and down
 
 
 def middle_of(camera: Camera) -> Camera:
@@ -35,10 +34,7 @@ def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Ca
 
     A camera that sees nothing there gets the median of the others. If no camera sees anything, all get 1.
 
-    Returns
-    -------
-    list of float
-        Scene units, one for each camera.
+    Returns scene units, one for each camera.
     """
     means = source.read(slice(0, source.count), ["means"])["means"]
     depths = []

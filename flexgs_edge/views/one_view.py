@@ -13,10 +13,8 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.references import to_half
 
-SPOOL_ROWS = 1 << 16
-"""Rows of a view that are copied from the backend at a time."""
-Part = tuple[np.ndarray, np.ndarray]
-"""Rows of a scene ([m] u32, ascending) and their sums ([m, planes] i64)."""
+SPOOL_ROWS = 1 << 16  # Rows of a view that are copied from the backend at a time
+Part = tuple[np.ndarray, np.ndarray]  # Rows of a scene ([m] u32, ascending) and their sums ([m, planes] i64)
 
 
 @dataclass(frozen=True)
@@ -24,8 +22,7 @@ class Drawn:
     """Sums and picture of a view that a worker drew."""
 
     parts: list[Part]
-    picture: np.ndarray | None
-    """[3, H, W] f16, in the layout of `References`: half the bytes to send."""
+    picture: np.ndarray | None  # [3, H, W] f16, in the layout of `References`: half the bytes to send
 
 
 def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:

@@ -15,35 +15,18 @@ from flexgs_edge.views.references import References
 
 @dataclass(frozen=True)
 class Original:
-    """The original from some poses.
+    """The original from some poses."""
 
-    Parameters
-    ----------
-    bench : Bench
-        Draws the views.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    cameras : sequence of Camera
-        Scored poses.
-    references : References
-        Renders of the original from `cameras`, then from `between`.
-    between : sequence of Camera
-        Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between them.
-    progress : Progress
-        Told of each view.
-    steps : int
-        Steps of the descent to the first candidate; 0 (default): colours are refitted instead.
-    turns : np.ndarray, optional
-        [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
-    """
-
-    bench: Bench
-    origin: np.ndarray
-    cameras: Sequence[Camera]
-    references: References
+    bench: Bench  # draws the views
+    origin: np.ndarray  # [3] f64, as in `SceneSource`
+    cameras: Sequence[Camera]  # scored poses
+    references: References  # renders of the original from `cameras`, then from `between`
+    # Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between
+    # them.
     between: Sequence[Camera] = ()
-    progress: Progress = SILENT
-    steps: int = 0
+    progress: Progress = SILENT  # told of each view
+    steps: int = 0  # steps of the descent to the first candidate; 0 (default): colours are refitted instead
+    # [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
     turns: np.ndarray | None = None
 
     @property

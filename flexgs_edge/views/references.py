@@ -31,10 +31,7 @@ class References:
     Half precision (11 bits) is finer than the 8 bits that viewers show. We read the file with plain reads, since the
     pages of a mapped file would count as memory of the process.
 
-    Parameters
-    ----------
-    scratch : path, optional
-        Folder of the scratch file; by default the system's folder for temporary files.
+    `scratch`: folder of the scratch file; by default the system's folder for temporary files.
     """
 
     def __init__(self, scratch: str | Path | None = None) -> None:

@@ -19,7 +19,7 @@ from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.cameras.witnesses import sh_basis, weighted_quantiles
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
 from flexgs_edge.methods.paper.scores import score_scene

@@ -13,8 +13,7 @@ import pytest
 from PIL import Image
 
 from flexgs_edge.api.scene import Scene
-from flexgs_edge.cameras.inria import inria_json
-from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.read import inria_json, read_cameras
 from flexgs_edge.cli import app
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RUB, FrameSource

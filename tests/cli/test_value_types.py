@@ -30,12 +30,7 @@ def test_views_that_are_none(text: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "colour"),
-    [
-        ("black", (0, 0, 0)),
-        ("White", (1, 1, 1)),
-        ("#ff0080", (1, 0, 128 / 255)),
-        ("0.5,0, 1", (0.5, 0, 1)),
-    ],
+    [("black", (0, 0, 0)), ("White", (1, 1, 1)), ("#ff0080", (1, 0, 128 / 255)), ("0.5,0, 1", (0.5, 0, 1))],
 )
 def test_colours(text: str, colour: tuple[float, float, float]) -> None:
     assert value_types.COLOUR.convert(text, None, None) == colour
@@ -48,8 +43,7 @@ def test_colours_that_are_none(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "direction"),
-    [("x", (1, 0, 0)), ("-Y", (0, -1, 0)), ("+z", (0, 0, 1)), ("0,-1, 0.2", (0, -1, 0.2))],
+    ("text", "direction"), [("x", (1, 0, 0)), ("-Y", (0, -1, 0)), ("+z", (0, 0, 1)), ("0,-1, 0.2", (0, -1, 0.2))]
 )
 def test_directions(text: str, direction: tuple[float, float, float]) -> None:
     assert value_types.AXIS.convert(text, None, None) == direction

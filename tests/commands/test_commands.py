@@ -77,11 +77,7 @@ def test_what_was_found_beside_the_scene_is_named(project: Path, done: tuple[Pat
     assert result.views is not None
     assert (result.views.total, result.views.train, result.views.held_out) == (VIEWS, 6, 3)
     text = result.summary()
-    for word in (
-        project / "cameras.json",
-        project / "images",
-        "held-out views, which decide only where",
-    ):
+    for word in (project / "cameras.json", project / "images", "held-out views, which decide only where"):
         assert str(word) in text
 
 

@@ -13,9 +13,9 @@ from camera_files import write_inria
 from flexgs_edge.cli import app
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v1.container import write_container
-from flexgs_edge.codec.v2.channels import Channels
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.codec.v2.header import Channels
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.render import render_views

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flexgs_edge.goals.line import AIM, next_point
+from flexgs_edge.methods.best.search import AIM, next_point
 
 
 def test_the_slope_is_that_between_the_nearest_points() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import (
     SSIM_PER_DB,
     KeptPart,
@@ -21,7 +20,7 @@ from flexgs_edge.goals.promise import (
     kept_promise,
     promised,
 )
-from flexgs_edge.goals.steps import Step, better
+from flexgs_edge.goals.steps import Choice, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality

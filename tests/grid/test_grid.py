@@ -10,9 +10,8 @@ import pytest
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.on_grid import grid_comment, lowered, on_grid, steps_of
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.rotations import canonical_axes
@@ -186,21 +185,6 @@ def test_steps_through_json() -> None:
     assert isinstance(make_grid(3), GridScene)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_values_of_a_grid_are_found_on_it_again(degree: int) -> None:
-    grid = make_grid(300, degree, 17)
-    planes = from_grid(grid)
-    steps = steps_of(("flexgs-edge knows", grid_comment(grid.step_sizes)))
-    assert steps == grid.step_sizes
-    order = np.random.default_rng(3).permutation(300)
-    again = on_grid({name: values[:, order] for name, values in planes.items()}, grid.step_sizes, grid.origin)
-    assert again is not None and again.step_sizes.sh == grid.step_sizes.sh[: again.sh_degree]
-    for name, values in from_grid(again).items():
-        np.testing.assert_array_equal(values, planes[name][: len(values)] if name != "sh_rest" else values)
-    np.testing.assert_array_equal(again.rotation, grid.rotation)
-    np.testing.assert_array_equal(again.dc, grid.dc)
-
-
 @pytest.mark.parametrize("zero_above", [0, 1, 2, 3])
 def test_degrees_are_as_low_as_the_codes_allow(zero_above: int) -> None:
     """Rows whose highest SH codes are zero come back from a file without that degree: the file must not count it."""
@@ -215,39 +199,10 @@ def test_degrees_are_as_low_as_the_codes_allow(zero_above: int) -> None:
         bands.append(codes)
     grid = replace(grid, sh=tuple(bands))
     low = lowered(grid)
-    again = on_grid(from_grid(grid), grid.step_sizes, grid.origin)
-    assert again is not None and low.sh_degree == again.sh_degree and low.step_sizes == again.step_sizes
     assert (low.sh_degrees <= grid.sh_degrees).all() and low.sh_degrees[rows].max(initial=0) <= zero_above
-    np.testing.assert_array_equal(low.sh_degrees, again.sh_degrees)
-    for mine, theirs in zip(low.sh, again.sh, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    for degree, codes in enumerate(low.sh, start=1):
+        # Every row has a code at its highest degree.
+        assert codes[:, low.sh_degrees[low.sh_degrees >= degree] == degree].any(axis=0).all()
     before, after = (from_grid(some)["sh_rest"].reshape(3, -1, 300) for some in (grid, low))
     np.testing.assert_array_equal(after, before[:, : after.shape[1]])
     assert not before[:, after.shape[1] :].any()
-
-
-@pytest.mark.parametrize("field", ["means", "quats", "sh_dc", "log_scales", "opacity_logits"])
-def test_values_that_were_changed_lie_on_no_grid(field: str) -> None:
-    grid = make_grid(60, 1, 18)
-    planes = from_grid(grid)
-    planes[field][-1, 7] = np.nextafter(planes[field][-1, 7], np.float32(9))
-    assert on_grid(planes, grid.step_sizes, grid.origin) is None
-    # Steps of another scene: nothing fits, and codes may be out of range.
-    tiny = replace(grid.step_sizes, position=1e-20)
-    assert on_grid(from_grid(grid), tiny, grid.origin) is None
-
-
-@pytest.mark.parametrize(
-    "words", ["flexgs-edge grid", "flexgs-edge grid {", "flexgs-edge grid [1]", 'flexgs-edge grid {"position": 1}', "x"]
-)
-def test_comments_that_say_nothing_of_a_grid(words: str) -> None:
-    assert steps_of((words,)) is None and steps_of(()) is None
-
-
-def test_comments_of_senseless_steps() -> None:
-    record = {**STEPS.to_json(), "position": -1.0}
-    assert steps_of((f"flexgs-edge grid {json.dumps(record)}",)) is None
-    for senseless in (None, 1e300, 10**400, "wide", [1.0]):
-        assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'position': senseless})}",)) is None
-    assert steps_of((f"flexgs-edge grid {json.dumps({**record, 'sh': 7})}",)) is None
-    assert steps_of(("flexgs-edge grid " + "[" * 100_000,)) is None

@@ -121,9 +121,7 @@ class Firefox:
         rect = self.send("WebDriver:GetWindowRect")
         inner = self.run("[innerWidth, innerHeight]")
         self.send(
-            "WebDriver:SetWindowRect",
-            width=rect["width"] + width - inner[0],
-            height=rect["height"] + height - inner[1],
+            "WebDriver:SetWindowRect", width=rect["width"] + width - inner[0], height=rect["height"] + height - inner[1]
         )
 
     def run(self, expression: str) -> Any:

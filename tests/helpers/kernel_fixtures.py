@@ -24,11 +24,7 @@ from flexgs_edge.scene.source import SceneSource
 FORMS = ("w16", "w8", "w4", "w1", "gpu", "gpu4")
 """Forms of the OpenCL kernels: vector widths of the CPU form; the GPU form, and that with four pixels a work-item."""
 ALL_FORMS = (*FORMS, "numpy")
-GPU_FORMS = {
-    "gpu": Form("gpu", 1),
-    "gpu4": Form("gpu", 4),
-    "fma": Form("gpu", 4, written_fma=True),
-}
+GPU_FORMS = {"gpu": Form("gpu", 1), "gpu4": Form("gpu", 4), "fma": Form("gpu", 4, written_fma=True)}
 
 
 def large_budget() -> MemoryBudget:

@@ -12,11 +12,10 @@ import numpy as np
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps
-from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.rounds import take_rows
-from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.scene.fields import FIELD
 from synthetic import random_scene
 

@@ -55,7 +55,7 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("layers", "kernels/cl_sources.py", "from flexgs_edge.render import renderer"),
         ("layers", "commands/trim.py", "import flexgs_edge.api.fgs_file"),
         ("layers", "attic.py", "A_MODULE = 'that nobody gave a floor'"),
-        ("methods", "methods/best/keep.py", "import flexgs_edge.methods.paper.scores"),
+        ("methods", "methods/best/poses.py", "import flexgs_edge.methods.paper.scores"),
         ("codec", "codec/v1/header.py", "import flexgs_edge.codec.v2.header"),
         ("codec_v2", "codec/v2/octree.py", "import flexgs_edge.codec.v2.walk"),
         ("views", "views/one_view.py", "import flexgs_edge.views.sums"),

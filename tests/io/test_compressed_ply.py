@@ -7,16 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exchanged import (
-    degrees_apart,
-    largest_errors,
-    opacities,
-    planes_of,
-    psnr_after,
-    refused,
-    scene,
-    there_and_back,
-)
+from exchanged import degrees_apart, largest_errors, opacities, planes_of, psnr_after, refused, scene, there_and_back
 from flexgs_edge.io.compressed_ply import CHUNK
 from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
 from flexgs_edge.io.ply import PlySource, write_ply

@@ -241,11 +241,7 @@ def test_the_origin(positions: list[list[float]], origin: list[float]) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    st.integers(0, 2**32 - 1),
-    st.floats(1e-3, 1e4),
-    st.tuples(*[st.floats(-1e7, 1e7) for _ in range(3)]),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e4), st.tuples(*[st.floats(-1e7, 1e7) for _ in range(3)]))
 def test_the_origin_is_on_the_grid_and_near_the_middle(seed: int, size: float, centre: tuple[float, ...]) -> None:
     positions = np.random.default_rng(seed).uniform(-size, size, (200, 3)) + centre
     origin = choose_origin(positions)

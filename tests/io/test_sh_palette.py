@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexgs_edge.io.codebook import best_codebook, nearest_codes
-from flexgs_edge.io.sh_palette import sh_palette
+from flexgs_edge.io.sh_palette import best_codebook, nearest_codes, sh_palette
 
 
 def least_error(values: np.ndarray, size: int) -> float:

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import InputError
+from flexgs_edge.io.codes import SMALLER, rounded_quats, unpack_small
 from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.io.frames import RUB, in_frame
-from flexgs_edge.io.quat_codes import SMALLER, rounded_quats, unpack_small
 from flexgs_edge.io.reading import Writing
 from flexgs_edge.io.sog_writer import palette_size, write_sog
 from flexgs_edge.scene.fields import FIELD, sh_rest_count

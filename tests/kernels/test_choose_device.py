@@ -230,7 +230,7 @@ def test_small_writes_do_not_wait(session: Session) -> None:
         values = np.full(4, 1, np.float32)
         session.write(given, values)
         start = time.perf_counter()
-        session.launch("slow", kernel, (1,), (1,), (given, seen))
+        session.enqueue("slow", kernel, (1,), (1,), (given, seen))
         values[:] = 2
         session.write(given, values)
         values[:] = 3
@@ -242,13 +242,13 @@ def test_small_writes_do_not_wait(session: Session) -> None:
             break
     assert early
     # Another write to the same array comes after it, and so do values that are mapped.
-    session.launch("slow", kernel, (1,), (1,), (given, seen))
+    session.enqueue("slow", kernel, (1,), (1,), (given, seen))
     session.write(given, values)
     session.write(given, values + 1)
     assert session.read(seen, np.empty(1, np.float32)) == [2]
     assert (session.read(given) == 4).all()
     for change in (session.write, session.fill):
-        session.launch("slow", kernel, (1,), (1,), (seen, seen))
+        session.enqueue("slow", kernel, (1,), (1,), (seen, seen))
         change(given, 0 if change == session.fill else values)
         with session.mapped(given) as mapped:
             mapped[:] = 5
@@ -268,7 +268,7 @@ def test_values_that_stay_are_not_waited_for(session: Session, waits: bool, monk
     for _ in range(TRIES):
         session.write(given, np.full(given.shape, 1, np.float32))
         start = time.perf_counter()
-        session.launch("slow", kernel, (1,), (1,), (given, seen))
+        session.enqueue("slow", kernel, (1,), (1,), (given, seen))
         session.write(given, np.full(given.shape, 2, np.float32), stays=True)
         found = session.read(seen, waits=False)
         behind = time.perf_counter() - start

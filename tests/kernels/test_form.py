@@ -11,11 +11,11 @@ import pyopencl as cl
 import pytest
 
 from flexgs_edge.errors import DeviceError
-from flexgs_edge.kernels import form_probe, self_test_child
+from flexgs_edge.kernels import self_test_child
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.form import Form, likely_form, possible_forms
-from flexgs_edge.kernels.form_probe import Measured, may_write_fma, measure_forms
 from flexgs_edge.kernels.opencl import OpenCLBackend
+from flexgs_edge.kernels.self_test_child import Measured, may_write_fma, measure_forms
 from kernel_fixtures import default_device, large_budget
 
 CPU = DeviceInfo(0, "a", "b", "cpu", "1", "OpenCL C 1.2", 2, 8, 4096, 1 << 15, 1 << 32, 1 << 30, "ok")
@@ -83,9 +83,9 @@ def test_fma_is_written_out_only_where_the_device_has_none(monkeypatch: pytest.M
     def seconds(faster: bool, form: Form) -> float:
         return 1 / form.width + (form.written_fma is not faster)
 
-    monkeypatch.setattr(form_probe, "OpenCLBackend", backend)
+    monkeypatch.setattr(self_test_child, "OpenCLBackend", backend)
     for faster, names in ((True, ["gpu4+fma", "gpu1+fma", "gpu1"]), (False, ["gpu4", "gpu1", "gpu1+fma"])):
-        monkeypatch.setattr(form_probe, "_seconds", partial(seconds, faster))
+        monkeypatch.setattr(self_test_child, "_seconds", partial(seconds, faster))
         measured, failed = measure_forms(device_with(flags.INF_NAN))
         assert [str(one.form) for one in measured] == names and failed == "the compiler refuses it"
 

@@ -18,11 +18,7 @@ EXP2_ERROR = 2.15e-7
 
 
 def run_probe(
-    form: str,
-    body: str,
-    inputs: list[np.ndarray],
-    outputs: int = 1,
-    dtype: type = np.float32,
+    form: str, body: str, inputs: list[np.ndarray], outputs: int = 1, dtype: type = np.float32
 ) -> list[np.ndarray]:
     """Run a throw-away kernel after constants and common.clh; `body` reads x0, x1, ... and writes y0, y1, ... at i."""
     backend = open_form(form)
@@ -32,7 +28,7 @@ def run_probe(
     names += [f"__global {kind} *y{k}" for k in range(outputs)]
     source = constants_header() + (kernel_dir() / "common.clh").read_text()
     source += f"\n__kernel void probe({', '.join(names)}) {{ const size_t i = get_global_id(0) * W; {body} }}\n"
-    session = backend.session
+    session = backend
     options = (f"-DW={backend.width}", *(["-DWRITTEN_FMA"] if backend.written_fma else []))
     kernel = session.kernel(source, "probe", options, "b" * len(names))
     size = inputs[0].size if inputs else backend.width
@@ -41,7 +37,7 @@ def run_probe(
     ]
     for array, values in zip(arrays, inputs):
         session.write(array, values)
-    session.launch("probe", kernel, (size // backend.width,), (1,), tuple(arrays))
+    session.enqueue("probe", kernel, (size // backend.width,), (1,), tuple(arrays))
     results = [session.read(array) for array in arrays[len(inputs) :]]
     for array in arrays:
         array.release()
@@ -213,9 +209,9 @@ def _read_scalars(body: str, count: int, dtype: type) -> np.ndarray:
     kind = "uint" if dtype is np.uint32 else "float"
     source = constants_header() + (kernel_dir() / "common.clh").read_text()
     source += f"\n__kernel void probe(__global {kind} *y0) {{ {body} }}\n"
-    kernel = backend.session.kernel(source, "probe", ("-DW=1",), "b")
-    array = backend.session.array((count,), dtype)
-    backend.session.launch("probe", kernel, (1,), (1,), (array,))
-    values = backend.session.read(array)
+    kernel = backend.kernel(source, "probe", ("-DW=1",), "b")
+    array = backend.array((count,), dtype)
+    backend.enqueue("probe", kernel, (1,), (1,), (array,))
+    values = backend.read(array)
     array.release()
     return values

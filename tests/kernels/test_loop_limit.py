@@ -9,8 +9,7 @@ import pytest
 
 from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.choose_device import LEAST_STEPS, SELF_TEST, run_self_test
-from flexgs_edge.kernels.loop_limit import LIMITED_BLOCKS, STEPS_A_PAIR
-from flexgs_edge.kernels.opencl import OpenCLBackend
+from flexgs_edge.kernels.opencl import LIMITED_BLOCKS, STEPS_A_PAIR, OpenCLBackend
 from flexgs_edge.render.renderer import Renderer
 from kernel_fixtures import default_device, draw, large_budget, open_form, same_bits
 from synthetic import make_camera, random_scene

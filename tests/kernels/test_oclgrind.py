@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.codec.v2.container import write_grid
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.container import decode_chunk, write_grid
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.step_sizes import StepSizes
@@ -28,9 +27,8 @@ from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.descent import Descent
+from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
 from flexgs_edge.methods.best.refit.distil import FIELD_RATES
-from flexgs_edge.methods.best.refit.prices import bit_prices
 from flexgs_edge.quality.flip import flips
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.fit import Fit
@@ -113,10 +111,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(
-        planes,
-        np.full(source.count, 4),
-        Original(Bench(drawer), source.origin, [camera], references),
-        rounds=1,
+        planes, np.full(source.count, 4), Original(Bench(drawer), source.origin, [camera], references), rounds=1
     )
     yield planes["sh_dc"]
     yield planes["sh_rest"]
@@ -185,10 +180,10 @@ def faulty(fault: str) -> None:
         "race": "out[0] = (float)get_global_id(0);",
         "barrier": "if (get_local_id(0) < 2) barrier(CLK_LOCAL_MEM_FENCE); out[get_global_id(0)] = 1.0f;",
     }[fault]
-    kernel = backend.session.kernel(f"__kernel void faulty(__global float *out) {{ {body} }}", "faulty", (), "b")
-    array = backend.session.array((4,), np.float32)
-    backend.session.launch("faulty", kernel, (4,), (4 if fault == "barrier" else 1,), (array,))
-    backend.session.finish()
+    kernel = backend.kernel(f"__kernel void faulty(__global float *out) {{ {body} }}", "faulty", (), "b")
+    array = backend.array((4,), np.float32)
+    backend.enqueue("faulty", kernel, (4,), (4 if fault == "barrier" else 1,), (array,))
+    backend.close()
     print(MARK, 1)
 
 

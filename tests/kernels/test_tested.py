@@ -16,7 +16,7 @@ import pytest
 
 from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError
-from flexgs_edge.kernels import programs
+from flexgs_edge.kernels import session as programs
 from flexgs_edge.kernels import tested as module
 from flexgs_edge.kernels import verdict as verdicts
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
@@ -234,9 +234,9 @@ def test_a_device_that_fails_in_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
         return call
 
     with pytest.raises(DeviceError, match="failed while running kernel blend .*devices --self-test"):
-        session.launch("blend", fails(cl.RuntimeError, "clEnqueueNDRangeKernel"), (1,), (1,), ())
+        session.enqueue("blend", fails(cl.RuntimeError, "clEnqueueNDRangeKernel"), (1,), (1,), ())
     with pytest.raises(BudgetError, match="ran out of memory while running kernel blend"):
-        session.launch("blend", fails(cl.MemoryError, "clEnqueueNDRangeKernel"), (1,), (1,), ())
+        session.enqueue("blend", fails(cl.MemoryError, "clEnqueueNDRangeKernel"), (1,), (1,), ())
     with monkeypatch.context() as patch:
         patch.setattr(cl, "enqueue_copy", fails(cl.LogicError, "clEnqueueReadBuffer"))
         for call in (lambda: session.read(array), lambda: session.write(array, [1, 2, 3, 4])):  # type: ignore[arg-type]

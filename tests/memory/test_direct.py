@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexgs_edge.memory.direct import BUFFER_BYTES, DirectFile, is_cached
+from flexgs_edge.memory.rows import BUFFER_BYTES, DirectFile, is_cached
 
 SIZE = BUFFER_BYTES + 3 * mmap.PAGESIZE + 5
 

@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from flexgs_edge.memory import heap
+from flexgs_edge.memory import process as heap
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.memory.heap import HeapWatch
+from flexgs_edge.memory.process import HeapWatch
 
 SCRIPT = """
 import numpy as np
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.process import current_rss
 arrays = [np.ones(8000) for _ in range(1000)]
 last = arrays.pop()  # it lies above the others, so that the heap cannot shrink from its end

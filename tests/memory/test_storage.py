@@ -20,7 +20,7 @@ from flexgs_edge.memory.ordered import stable_order
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage, file_system_of
 from flexgs_edge.methods.best.checkpoint import Checkpoint
-from flexgs_edge.methods.best.snapshot import lowest
+from flexgs_edge.methods.best.costs import lowest
 
 COUNT = 40_000
 

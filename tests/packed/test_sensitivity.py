@@ -6,8 +6,7 @@ from dataclasses import asdict
 
 import pytest
 
-from flexgs_edge.packed.bitspec import BitSpec
-from flexgs_edge.packed.sensitivity import search_bits
+from flexgs_edge.packed.bitspec import BitSpec, search_bits
 from flexgs_edge.quality.psnr import error_for_drop
 
 RISE = {"dc": 8e-6, "scale": 4e-4, "rot": 9e-5, "opacity": 1e-6, "rest": 3e-6}

@@ -7,12 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import Step
+from flexgs_edge.goals.steps import Choice, Step
 from flexgs_edge.goals.target import MaxDrop, Measurement
-from flexgs_edge.report.camera_plan import plans
 from flexgs_edge.report.material import Rig
-from flexgs_edge.report.search_chart import nice_range, step_chart
+from flexgs_edge.report.pages import nice_range, plans, step_chart
 from flexgs_edge.report.tones import ERROR_SCALE, error_map, ramp
 from page_parser import Page
 

@@ -18,8 +18,7 @@ from flexgs_edge.cli import app
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import SearchResult, Step
+from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
@@ -27,16 +26,14 @@ from flexgs_edge.quality.flip import flip_maps
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.material import Material, Rig, Shot
-from flexgs_edge.report.pages import compress_page, evaluate_page
+from flexgs_edge.report.pages import compress_page, evaluate_page, step_chart
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.search_chart import step_chart
 from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.companions import companions_of
 from flexgs_edge.run.open_scene import open_scene
-from flexgs_edge.run.pictures import encode
-from flexgs_edge.run.reporter import Reporter
+from flexgs_edge.run.reporter import Reporter, encode
 from page_parser import Page
 from tiny_project import HEIGHT, WIDTH, make_project, write_cameras
 

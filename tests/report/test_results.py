@@ -11,7 +11,7 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import quality_json
 from flexgs_edge.report.file_results import DecompressResult, RenderResult
 from flexgs_edge.report.results import EvaluateResult
-from flexgs_edge.report.run_info import PLY_HEADER_MOST, RunInfo, SceneInfo, ViewsInfo
+from flexgs_edge.report.run_info import PLY_HEADER_MOST, RunInfo, SceneInfo, ViewsInfo, fields_json
 from flexgs_edge.report.summary import ratio_lines
 
 RUN = RunInfo(1.25, {"open": 0.25, "device": 0.5}, 0.5, 0.125, 2**30, 2**28, {"backend": "numpy", "numpy": "2"})
@@ -112,7 +112,7 @@ def test_time_of_a_view_is_the_median_without_start_up(seconds: tuple[float, ...
 def test_sizes_are_compared_with_the_input_first(given: int | None, size: int, lines: list[str]) -> None:
     scene = replace(SCENE, count=10_000, ply_bytes=2_480_000, bytes=given)
     assert ratio_lines(scene, size) == lines
-    assert scene.to_json()["bytes"] == given
+    assert fields_json(scene)["bytes"] == given
     assert scene.ratio_of(size) == (None if given is None else given / size)
 
 

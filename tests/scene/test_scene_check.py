@@ -37,8 +37,7 @@ def test_an_empty_scene_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [(f, v) for f in ALL for v in (np.nan, np.inf, -np.inf) if (f, v) not in VALID],
+    ("field", "value"), [(f, v) for f in ALL for v in (np.nan, np.inf, -np.inf) if (f, v) not in VALID]
 )
 @pytest.mark.parametrize("chunk_rows", [3, 64])
 def test_a_bad_value_is_named_and_can_be_dropped(field: str, value: float, chunk_rows: int) -> None:

@@ -10,7 +10,7 @@ import pytest
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import BarChart, LineChart, Series, draw
-from flexgs_edge.studies.stability import removal, unseen_poses
+from flexgs_edge.studies.stability import unseen_poses
 from flexgs_edge.views.depths import visible_depths
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats
@@ -55,10 +55,3 @@ def test_the_worst_tile() -> None:
     image[70:, 66:] = 0.5  # wholly inside the tile at the corner, 36 x 6 pixels of it
     assert unseen_poses.worst_tile(image, reference) == pytest.approx(0.25 * (30 * 4) / (36 * 6))
     assert unseen_poses.worst_tile(image, reference, side=1000) == pytest.approx(mse(image, reference))
-
-
-def test_halves_of_a_path() -> None:
-    line = [make_camera(translation=(-x, 0.0, 0.0)) for x in (0.0, 1.0, 2.0, 7.0)]
-    axis, middle = removal.longest_axis(line)
-    sides = removal.half_of(line, axis, middle)
-    assert abs(axis[0]) == pytest.approx(1.0) and sides.sum() == 2 and sides[0] == sides[1] != sides[2]

@@ -27,7 +27,7 @@ from flexgs_edge.codec.v1.header import container_size
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_folder, check_folder
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import MaxDrop
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget

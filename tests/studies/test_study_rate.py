@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
-import numpy as np
 import pytest
 
 from flexgs_edge.cli import app
@@ -20,19 +19,13 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import min_ratio
 from flexgs_edge.io.exchange import read_foreign, write_foreign
-from flexgs_edge.methods.best.allocation import BitModel, choose
-from flexgs_edge.methods.best.costs import RemovalCosts
-from flexgs_edge.methods.best.method import open_rounds
-from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.paper.prune import ranks_from_order
 from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import LineChart, Series, draw, picture
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.rate import ablations
 from flexgs_edge.studies.rate import study as rate
-from flexgs_edge.studies.rate.curves import Curve
 from flexgs_edge.studies.rate.points import best_points, paper_points
 from flexgs_edge.studies.rate.study import RateStudy, study_rate
+from flexgs_edge.studies.rate.trade import Curve
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
 from tiny_project import COUNT, make_project
 
@@ -57,18 +50,9 @@ def studied(project: Path) -> Iterator[StudyScene]:
 def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RateStudy, Path]:
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        # One format of another program and every other part: what is left out goes the same way.
+        # One format of another program: the others go the same way.
         patch.setattr("flexgs_edge.studies.rate.points.PEERS", (".spz",))
-        patch.setattr("flexgs_edge.studies.rate.study.parts_of", lambda *words: ablations.parts_of(*words)[::2])
-        found = study_rate(
-            project / "point_cloud.ply",
-            out,
-            OPTIONS,
-            ratios=[RATIO],
-            ablations=[RATIO],
-            ablation_effort="fast",
-            distilled=[RATIO],
-        )
+        found = study_rate(project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO], distilled=[RATIO])
     return found, out
 
 
@@ -102,21 +86,10 @@ def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene
     assert others[0].size == studied.adapt(min_ratio(5.0, studied.run.scene.ply_bytes, "drop")).chosen.size
 
 
-def test_every_variant_is_there_and_keeps_to_the_ratio(study: tuple[RateStudy, Path], studied: StudyScene) -> None:
+def test_points_keep_to_the_ratio(study: tuple[RateStudy, Path]) -> None:
     rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
-    assert [row["variant"] for row in rows] == ["whole", "whole", "gs ranks", "no refit", "full SH"]
-    assert [row["effort"] for row in rows if row["variant"] == "whole"] == ["fast", "max"]
-    for row in rows:
-        assert float(str(row["ratio"])) >= RATIO
-    sizes = [row["size"] for row in rows]
-    assert len(set(sizes)) == len(sizes), "nothing was taken away somewhere"
-    names = [variant.name for variant in ablations.parts_of(studied.orders["gs"], 0, False)]
-    assert names == ["gs ranks", "one pass", "no refit"], "no SH, nothing to choose of them"
-
-
-def test_the_whole_method_costs_nothing_against_itself(study: tuple[RateStudy, Path]) -> None:
-    (row,) = (row for row in rows_of(study, "parts") if row["variant"] == "whole")
-    assert (row["more_bytes"], row["more_modelled"], row["more_loss"]) == (0.0, 0.0, 0.0)
+    assert [(row["variant"], row["effort"]) for row in rows] == [("whole", "fast"), ("whole", "max")]
+    assert all(float(str(row["ratio"])) >= RATIO for row in rows) and len({row["size"] for row in rows}) == 2
 
 
 def test_another_format_holds_the_whole_scene(
@@ -133,7 +106,7 @@ def test_another_format_holds_the_whole_scene(
 
 def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> None:
     result, out = study
-    keys = ["rate", "fidelity", "parts"]
+    keys = ["rate", "fidelity"]
     assert [experiment.key for experiment in result.scene.experiments] == keys
     wanted = {f"{key}.{suffix}" for key in keys for suffix in ("csv", "json", "png", "svg")}
     assert {path.name for path in out.iterdir()} == {"index.html", *wanted}
@@ -144,7 +117,6 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
     assert isinstance(chart, LineChart)
     drawn = {series.label: [round(1e6 * x) for x in series.x] for series in chart.series}
     rows = rows_of(study, "rate")
-    # Only what is whole is drawn: points without a part have a chart of their own.
     assert drawn["best"] + drawn["best, distilled"] == [
         row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"
     ]
@@ -154,12 +126,7 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
 
 def test_without_photos(project: Path, tmp_path: Path) -> None:
     found = study_rate(
-        project / "point_cloud.ply",
-        tmp_path / "out",
-        replace(OPTIONS, images="none"),
-        ratios=[RATIO],
-        ablations=[],
-        distilled=[],
+        project / "point_cloud.ply", tmp_path / "out", replace(OPTIONS, images="none"), ratios=[RATIO], distilled=[]
     )
     (experiment,) = found.scene.experiments
     assert isinstance(experiment.chart, LineChart) and "fidelity" in experiment.chart.y_label
@@ -169,60 +136,8 @@ def test_without_photos(project: Path, tmp_path: Path) -> None:
 
 def test_a_ratio_out_of_reach_is_said(studied: StudyScene, project: Path) -> None:
     # A header of 2 kB is more than a thousandth of the scene.
-    found = best_points(studied, ablations.WHOLE, "fast", [1000.0])
-    assert found.points == () and found.missing == ("best (whole, fast) at 1000x",)
-
-
-def test_ranks_decide_who_goes_and_costs_how_many(studied: StudyScene) -> None:
-    order = np.random.default_rng(5).permutation(COUNT)
-
-    def walk(make: object) -> PruneRounds:
-        cameras = studied.views.of(studied.views.train)
-        run = replace(studied.run, options=OPTIONS)
-        with open_rounds(run, studied.bench, cameras, make=make) as rounds:  # type: ignore[arg-type]
-            rounds.descend(0.8)
-        return rounds
-
-    rounds = walk(PruneRounds)
-    measured, ranks = rounds.snapshots, ranks_from_order(order)[rounds.rows]
-    ranked = walk(lambda *w, **m: ablations.RankedPath(*w, order=order, **m)).snapshots
-    seen = measured[0].costs.weight2 > 0
-    assert np.array_equal(np.sort(ranked[0].costs.removal[seen]), np.sort(measured[0].costs.removal[seen]))
-    by_rank = np.argsort(ranks[measured[0].rows[seen]])
-    assert (np.diff(ranked[0].costs.removal[seen][by_rank]) >= 0).all()
-    gone = np.setdiff1d(ranked[0].rows, ranked[1].rows)
-    stayed = np.intersect1d(ranked[0].rows[seen], ranked[1].rows)
-    assert len(gone) == len(measured[0].rows) - measured[1].count and ranks[gone].max() < ranks[stayed].min()
-
-    once = walk(ablations.OnePassPath).snapshots
-    assert np.array_equal(once[1].rows, measured[1].rows)
-    at = np.searchsorted(once[0].rows, once[1].rows)
-    assert np.array_equal(once[1].costs.removal, once[0].costs.removal[at])
-    assert not np.array_equal(measured[1].costs.removal, measured[0].costs.removal[at])
-    assert np.array_equal(once[1].costs.weight2, measured[1].costs.weight2)
-
-
-def test_choosing_among_all_degrees_is_the_methods_own_choice() -> None:
-    rng = np.random.default_rng(11)
-    count, top = 500, 3
-    weight2 = np.where(np.arange(count) < 20, 0.0, 1.0)
-    costs = RemovalCosts(
-        rng.lognormal(0, 3, count),
-        weight2,
-        -np.sort(-rng.lognormal(-1, 2, (top, count)), axis=0),
-        np.zeros((top, 3, count)),
-    )
-    bits, multiplier = BitModel(), 0.05
-    for found, own in zip(
-        ablations.choose_among(costs, bits, multiplier, range(top + 1)), choose(costs, bits, multiplier), strict=True
-    ):
-        assert np.array_equal(found, own)
-    keep, degrees = ablations.choose_among(costs, bits, multiplier, (0, top))
-    assert set(degrees[weight2 > 0]) == {0, top} and keep[:20].all() and not degrees[:20].any()
-    full, degrees = ablations.choose_among(costs, bits, multiplier, (top,))
-    assert set(degrees[weight2 > 0]) == {top}
-    # Gaussians that must bring all their SH along are worth keeping less often.
-    assert 0 < full.sum() < keep.sum() < count
+    found = best_points(studied, "fast", [1000.0])
+    assert found.points == () and found.missing == ("best (fast) at 1000x",)
 
 
 def test_a_curve_reads_power_laws_and_ends_at_its_points() -> None:
@@ -249,9 +164,8 @@ def test_a_chart_over_megabytes_has_a_log_axis_and_need_not_start_at_zero() -> N
     [
         ({"ratios": [0.5]}, "--ratios 0.5: expected ratios of 1 or more"),
         ({"ratios": []}, "--ratios: expected one ratio or more"),
-        ({"ablations": [math.nan]}, "--ablations nan"),
+        ({"ratios": [math.nan]}, "--ratios nan"),
         ({"distilled": [0.1]}, "--distilled 0.1: expected ratios of 1 or more"),
-        ({"ablation_effort": "lazy"}, "--ablation-effort 'lazy': expected one of fast"),
     ],
 )
 def test_ratios_are_checked_before_any_work(tmp_path: Path, words: dict[str, object], said: str) -> None:
@@ -270,16 +184,16 @@ def test_the_command_line_hands_on_what_it_is_told(
         return study[0]
 
     monkeypatch.setattr("flexgs_edge.studies.rate.study.study_rate", told_study)
-    words = ["study", "rate", "a.ply", "-o", str(tmp_path / "out"), "--ratios", "10,20", "--ablations", "none", "-q"]
+    words = ["study", "rate", "a.ply", "-o", str(tmp_path / "out"), "--ratios", "10,20", "-q"]
     with pytest.raises(SystemExit) as left:
         app.main([*words, "--json", "-"])
     assert left.value.code == 0
     assert told == {
-        "ratios": (10.0, 20.0), "ablations": (), "ablation_effort": "fast", "effort": "balanced", "scene": "a.ply",
+        "ratios": (10.0, 20.0), "effort": "balanced", "scene": "a.ply",
         "distilled": (32.0, 64.0, 128.0),
     }  # fmt: skip
     out = capsys.readouterr()
-    assert json.loads(out.out)["command"] == "study rate" and "Each part earns its place" in out.err
+    assert json.loads(out.out)["command"] == "study rate" and "Bytes and fidelity" in out.err
     with pytest.raises(SystemExit) as left:
         app.main([*words, "--ratios", "10;20"])
     assert left.value.code == 2 and "expected ratios such as 8,16,32, or none" in capsys.readouterr().err
@@ -295,6 +209,4 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     # Written twice: the library is not loaded to show the help.
     defaults = {option.name: option.default for option in options}
     assert RATIOS.convert(defaults["ratios"], None, None) == rate.RATIOS
-    assert RATIOS.convert(defaults["ablations"], None, None) == rate.ABLATED
     assert RATIOS.convert(defaults["distilled"], None, None) == rate.DISTILLED
-    assert defaults["ablation_effort"] == rate.ABLATION_EFFORT

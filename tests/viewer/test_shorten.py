@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from flexgs_edge.viewer import shorten
+from flexgs_edge.viewer import join as shorten
 from flexgs_edge.viewer.assets import web_files
-from flexgs_edge.viewer.shorten import shorten_script, shorten_style
+from flexgs_edge.viewer.join import shorten_script, shorten_style
 
 
 def test_shaders_lose_what_only_readers_need() -> None:

@@ -97,12 +97,7 @@ def arriving(tab: Browser, scene: Path, cameras: str, goes_on: threading.Event, 
 
 
 def test_a_preview_is_shown_until_the_first_layer_is_there(
-    tab: Browser,
-    scene: Path,
-    sample_dir: Path,
-    drawn: Drawn,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    tab: Browser, scene: Path, sample_dir: Path, drawn: Drawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server stops in the second of the chunks that the first layer has."""
     scene, small = previewed(scene, tmp_path, 8192)
@@ -136,12 +131,7 @@ def patchwork(scene: Path, small: Path, here: list[int]) -> dict[str, np.ndarray
 
 
 def test_where_a_chunk_comes_the_preview_goes(
-    tab: Browser,
-    scene: Path,
-    sample_dir: Path,
-    drawn: Drawn,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    tab: Browser, scene: Path, sample_dir: Path, drawn: Drawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a scene whose file tells where its chunks lie, the server stops behind some of those in sight."""
     scene, small = previewed(scene, tmp_path, 1024)

@@ -9,10 +9,9 @@ from flexgs_edge.cli.lazy_group import LazyGroup
 COMMANDS = {
     "paper": "Repeat the FlexGaussian paper's experiments on your scenes.",
     "rate": "Chart bytes against quality for a scene.",
-    "speed": "Chart speed against accuracy for a scene.",
+    "speed": "Chart the time of a run against the ratio that it finds.",
     "stability": "Find where methods break on a scene.",
-}
-"""Subcommands and the first sentence of their help."""
+}  # Subcommands and the first sentence of their help
 
 
 @click.group(cls=LazyGroup, commands_from=("flexgs_edge.cli.study", COMMANDS))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import click
@@ -29,12 +28,6 @@ class RatiosType(click.ParamType):
 RATIOS = RatiosType()
 
 
-def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Decorated], help_page.Decorated]:
-    """A choice of effort."""
-    efforts = click.Choice(["fast", "balanced", "max"])
-    return help_page.option("Points", name, type=efforts, default=default, show_default=True, help=text)
-
-
 @click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
@@ -46,17 +39,13 @@ def effort_option(name: str, default: str, text: str) -> Callable[[help_page.Dec
     show_default=True,
     help="Ratios to the .ply that both methods aim at.",
 )
-@effort_option("--effort", "balanced", "Effort of the search at these ratios, as for compress.")
 @help_page.option(
     "Points",
-    "--ablations",
-    type=RATIOS,
-    default="16,64",
+    "--effort",
+    type=click.Choice(["fast", "balanced", "max"]),
+    default="balanced",
     show_default=True,
-    help="Ratios for --method best without each of its parts; none: skip this.",
-)
-@effort_option(
-    "--ablation-effort", "fast", "Effort of the search at --ablations. Less is faster; fast does not descend."
+    help="Effort of the search at these ratios, as for compress.",
 )
 @help_page.option(
     "Points",
@@ -71,8 +60,6 @@ def command(
     scene: str,
     output: str,
     ratios: tuple[float, ...],
-    ablations: tuple[float, ...],
-    ablation_effort: str,
     distilled: tuple[float, ...],
     json_path: str | None,
     quiet: bool,
@@ -83,9 +70,6 @@ def command(
     \b
       - both methods of compress, at several ratios
       - the whole scene as .spz, .sog and .compressed.ply
-      - --method best without each of its parts: measured costs, measuring
-        again, the refit, the SH degree of each Gaussian;
-        where searches descend, also parts of the descents
 
     The same views judge every file: held-out photos where there are some. Results appear in DIR when all is done: open
     DIR/index.html; rate.csv has all points. More ratios and more effort take longer.
@@ -93,22 +77,13 @@ def command(
     \b
     Examples:
       flexgs-edge study rate point_cloud.ply -o rate
-      flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40 --ablations none
-      flexgs-edge study rate scene.ply -o rate --effort max --ablation-effort balanced
+      flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40
+      flexgs-edge study rate scene.ply -o rate --effort max --distilled none
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
     from flexgs_edge.studies.rate.study import study_rate
 
     made = CompressOptions(**options)
-    result = study_rate(
-        scene,
-        output,
-        made,
-        progress,
-        ratios=ratios,
-        ablations=ablations,
-        ablation_effort=ablation_effort,
-        distilled=distilled,
-    )
+    result = study_rate(scene, output, made, progress, ratios=ratios, distilled=distilled)
     talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

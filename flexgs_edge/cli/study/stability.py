@@ -12,12 +12,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@help_page.option(
-    "Points",
-    "--quick",
-    is_flag=True,
-    help="Fewer points and small views: much faster, less exact.",
-)
+@help_page.option("Points", "--quick", is_flag=True, help="Fewer points and small views: much faster, less exact.")
 @help_page.option(
     "Points",
     "--max-drop",
@@ -32,13 +27,11 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
     """Find where methods break on a scene.
 
     \b
-      pruning, views, halves more removed; scores from few views, or one side
       heldout, distance,     the worst view; cameras nearer, farther, between
       poses                  and above the path; other lenses and sizes
-      generations            compressed again and again
 
-    Compares both methods with simple baselines: plain rounding, removing Gaussians or SH alone, simple scores. A method breaks
-    where it loses far too much PSNR or ends in an error. Results appear in DIR when all is done: open DIR/index.html.
+    Compares both methods with simple baselines: plain rounding, and removing Gaussians or SH alone. A method breaks where it
+    loses far too much PSNR. Results appear in DIR when all is done: open DIR/index.html.
 
     \b
     Examples:

@@ -29,8 +29,7 @@ __all__ = ["Container", "Section", "container_size", "read_header", "verify", "w
 
 VERSION = 1
 
-Ranges = dict[str, tuple[np.ndarray, np.ndarray]]
-"""(low, step) of each field, [channels, G] f32 both."""
+Ranges = dict[str, tuple[np.ndarray, np.ndarray]]  # (low, step) of each field, [channels, G] f32 both
 
 
 def write_container(
@@ -38,21 +37,9 @@ def write_container(
 ) -> int:
     """Write a quantized scene into a file, which gets its name only when it is complete.
 
-    Parameters
-    ----------
-    path : path
-        Usually ends in `.fgs`.
-    quantized : QuantizedScene
-        From `quantize_scene`.
-    settings : mapping
-        JSON values that tell how the file was made; nothing that differs between runs or machines.
-    force : bool, optional
-        Replace an existing file.
-
-    Returns
-    -------
-    int
-        Bytes of the file, equal to `container_size`.
+    `path`: usually ends in `.fgs`. `quantized`: from `quantize_scene`. `settings`: JSON values that tell how the file
+    was made; nothing that differs between runs or machines. `force`: replace an existing file. Returns bytes of the
+    file, equal to `container_size`.
     """
     header = Header.of_scene(quantized, settings)
     block = encode_header(header)
@@ -88,17 +75,9 @@ def read_header(path: str | os.PathLike[str]) -> Header:
 class Container(SectionFile):
     """A file of version 1; its header is checked against the size of the file.
 
-    Parameters
-    ----------
-    path : path
-        The file is opened for each read, and never held open.
-
-    Raises
-    ------
-    FormatError
-        If anything differs from the format; the message names the byte, the expected and the found value.
-    InputError
-        If the file cannot be read at all.
+    `path`: the file is opened for each read, and never held open. Raises `FormatError` if anything differs from the
+    format; the message names the byte, the expected and the found value. Raises `InputError` if the file cannot be read
+    at all.
     """
 
     version = VERSION
@@ -162,17 +141,8 @@ class Container(SectionFile):
 def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
     """Check every byte of a file, which is read in pieces.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    raise_errors : bool, optional
-        If False, report damage after the header as `ok=False` instead of raising an error.
-
-    Returns
-    -------
-    list of Section
-        All sections in the order of the file.
+    `path`: the file. `raise_errors`: if False, report damage after the header as `ok=False` instead of raising an
+    error. Returns all sections in the order of the file.
     """
     container = Container(path)
     header = container.header

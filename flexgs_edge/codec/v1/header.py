@@ -26,15 +26,12 @@ from flexgs_edge.packed.quantize import QuantizedScene, group_count
 from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
-CHUNK_ROWS = 65536
-"""Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits."""
-HEADER_STEP = 1024
-"""Headers are padded to a multiple of this many bytes."""
+CHUNK_ROWS = 65536  # Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits
+HEADER_STEP = 1024  # Headers are padded to a multiple of this many bytes
 HEADER_MIN = 2048
 """Least bytes of a header; normal ones fit, so that the size of a file does not depend on the digits of its numbers."""
 HEADER_MAX = 1 << 20
-HEADER_OWN = 512
-"""Most bytes of the header without the settings (counts of 10 digits, numbers of 24)."""
+HEADER_OWN = 512  # Most bytes of the header without the settings (counts of 10 digits, numbers of 24)
 _KEYS = ("bits", "count", "groups", "origin", "settings", "sh_count", "sh_degree")
 
 
@@ -42,33 +39,18 @@ _KEYS = ("bits", "count", "groups", "origin", "settings", "sh_count", "sh_degree
 class Header:
     """The header of a version 1 file.
 
-    Parameters
-    ----------
-    count, sh_count, sh_degree : int
-        As in `QuantizedScene`.
-    origin : tuple of float
-        World position that the means are relative to.
-    bits : BitSpec
-        Bits per code.
-    groups : dict
-        Groups per channel, by the attribute names of `BitSpec`.
-    settings : dict
-        How the file was made (JSON values).
-    block : int
-        Bytes of the padded header in the file.
-    contraction : Contraction or None
-        As in `QuantizedScene`.
+    `count`, `sh_count`, `sh_degree`: as in `QuantizedScene`.
     """
 
     count: int
     sh_count: int
     sh_degree: int
-    origin: tuple[float, float, float]
-    bits: BitSpec
-    groups: dict[str, int]
-    settings: dict[str, Any]
-    block: int = HEADER_MIN
-    contraction: Contraction | None = None
+    origin: tuple[float, float, float]  # world position that the means are relative to
+    bits: BitSpec  # bits per code
+    groups: dict[str, int]  # groups per channel, by the attribute names of `BitSpec`
+    settings: dict[str, Any]  # how the file was made (JSON values)
+    block: int = HEADER_MIN  # bytes of the padded header in the file
+    contraction: Contraction | None = None  # as in `QuantizedScene`
 
     @classmethod
     def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> Header:
@@ -143,25 +125,15 @@ class Header:
 def container_size(
     count: int,
     sh_count: int,
-    sh_degree: int,
-    bits: BitSpec,
-    groups: int | None = None,
+    sh_degree: int,  # degree of the scene; counts as 0 if `sh_count` is 0
+    bits: BitSpec,  # bits per code
+    groups: int | None = None,  # as for `quantize_scene`
     settings: Mapping[str, Any] | None = None,
 ) -> int:
     """Exact size of a container in bytes, before anything is quantized.
 
-    Parameters
-    ----------
-    count, sh_count : int
-        Rows, and rows with SH.
-    sh_degree : int
-        Degree of the scene; counts as 0 if `sh_count` is 0.
-    bits : BitSpec
-        Bits per code.
-    groups : int, optional
-        As for `quantize_scene`.
-    settings : mapping, optional
-        Needed only if their JSON is longer than `HEADER_MIN - HEADER_OWN` bytes.
+    `count`, `sh_count`: rows, and rows with SH. `settings`: needed only if their JSON is longer than `HEADER_MIN -
+    HEADER_OWN` bytes.
     """
     if sh_degree == 0 or sh_count == 0:
         sh_degree = sh_count = 0

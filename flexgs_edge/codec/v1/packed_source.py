@@ -49,12 +49,7 @@ class CodedSource(SceneSource):
 class QuantizedSource(CodedSource):
     """A quantized scene in memory, as a scene source.
 
-    Parameters
-    ----------
-    scene : QuantizedScene
-        Not copied.
-    name : str, optional
-        Name of the scene in messages.
+    `scene`: not copied. `name`: name of the scene in messages.
     """
 
     def __init__(self, scene: QuantizedScene, name: str = "quantized scene") -> None:
@@ -74,20 +69,8 @@ class QuantizedSource(CodedSource):
 class FgsSource(CodedSource):
     """A version 1 file as a scene. Memory holds the ranges and the last chunk; a chunk is read and checked when needed.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Attributes
-    ----------
-    settings : dict
-        How the file was made.
-
-    Raises
-    ------
-    FormatError
-        If the file differs from the format; a damaged chunk raises it when it is read.
+    `path`: the file. `settings`: how the file was made. Raises `FormatError` if the file differs from the format; a
+    damaged chunk raises it when it is read.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

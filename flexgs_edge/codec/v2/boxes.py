@@ -11,10 +11,8 @@ from flexgs_edge.codec.v2.chunk_plan import Chunk
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.rows import read_rows
 
-BOXES = "boxes"
-"""Its name among the settings of a file."""
-FEWEST, MOST = 8, 4096
-"""Fewer chunks come one after the other anyway; of more, the header would grow too long."""
+BOXES = "boxes"  # Its name among the settings of a file
+FEWEST, MOST = 8, 4096  # Fewer chunks come one after the other anyway; of more, the header would grow too long
 
 
 def with_boxes(settings: Mapping[str, Any], grid: GridScene, chunks: Sequence[Chunk]) -> dict[str, Any]:

@@ -14,20 +14,35 @@ import numpy as np
 from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
 from flexgs_edge.codec.v2.boxes import with_boxes
-from flexgs_edge.codec.v2.channels import Channels
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, check_end, least_bytes
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
-from flexgs_edge.codec.v2.header import HEADER_MOST, GridHeader, decode_header, encode_header
+from flexgs_edge.codec.v2.header import HEADER_MOST, Channels, GridHeader, decode_header, encode_header
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.octree import TooManyNodes
-from flexgs_edge.codec.v2.rans import StreamError
-from flexgs_edge.codec.v2.walk import ChunkCodes
+from flexgs_edge.codec.v2.ports import DecodePort
+from flexgs_edge.codec.v2.rans import Decoder, StreamError, lane_count
+from flexgs_edge.codec.v2.walk import ChunkCodes, walk_chunk
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import atomic_write
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+
+
+def decode_chunk(
+    model: Model, rows: int, data: bytes, base_only: bool = False, cost: np.ndarray | None = None
+) -> ChunkCodes:
+    """Decode the codes of a chunk; raises `StreamError` for bytes that no encoder writes.
+
+    `model`: the model of the file. `rows`: rows of the chunk. `data`: the whole chunk. `base_only`: stop before the SH;
+    False by default. `cost`: [alphabets] f64, to which the bits of each alphabet are added.
+    """
+    stream = Decoder(data, lane_count(rows))
+    codes = walk_chunk(rows, model.depth, model.sh_degree, DecodePort(model, stream, cost), None, base_only)
+    if not base_only:
+        check_end(data, rows, stream.finish())
+    return codes
+
 
 VERSION = 2
 
@@ -35,45 +50,22 @@ Result = TypeVar("Result")
 
 
 def write_grid(
-    path: str | os.PathLike[str],
-    grid: GridScene,
+    path: str | os.PathLike[str],  # usually ends in `.fgs`
+    grid: GridScene,  # from `to_grid`
     settings: Mapping[str, Any],
     *,
-    force: bool = False,
-    chunk_rows: int = CHUNK_ROWS,
-    device: Device | None = None,
-    encoded: Encoded | None = None,
-    storage: Storage = IN_MEMORY,
+    force: bool = False,  # replace an existing file
+    chunk_rows: int = CHUNK_ROWS,  # rows of a chunk, at most 65536 (default)
+    device: Device | None = None,  # Counts and codes the symbols; the bytes are the same. NumPy by default.
+    encoded: Encoded | None = None,  # the result of `encode_grid(grid, chunk_rows)`, if the caller has it already
+    storage: Storage = IN_MEMORY,  # holds the symbols until they are written
     preview: bytes = b"",
 ) -> int:
     """Encode a grid scene into a file, which gets its name only when it is complete.
 
-    Parameters
-    ----------
-    path : path
-        Usually ends in `.fgs`.
-    grid : GridScene
-        From `to_grid`.
-    settings : mapping
-        JSON values that tell how the file was made; nothing that differs between runs or machines. A file of many chunks
-        also tells where they lie.
-    force : bool, optional
-        Replace an existing file.
-    chunk_rows : int, optional
-        Rows of a chunk, at most 65536 (default).
-    device : Device, optional
-        Counts and codes the symbols; the bytes are the same. NumPy by default.
-    encoded : Encoded, optional
-        The result of `encode_grid(grid, chunk_rows)`, if the caller has it already.
-    storage : Storage, optional
-        Holds the symbols until they are written.
-    preview : bytes, optional
-        A file of a much smaller scene, for viewers to show until the first layer is there. Default: none.
-
-    Returns
-    -------
-    int
-        Bytes of the file, equal to `coded_size`.
+    `settings`: JSON values that tell how the file was made; nothing that differs between runs or machines. A file of
+    many chunks also tells where they lie. `preview`: a file of a much smaller scene, for viewers to show until the
+    first layer is there. Default: none. Returns bytes of the file, equal to `coded_size`.
     """
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     model = encoded.model.to_bytes()
@@ -112,10 +104,7 @@ def trim_container(
 
     If not even the first layer fits, the new file is the preview.
 
-    Raises
-    ------
-    TargetError
-        If nothing fits.
+    Raises `TargetError` if nothing fits.
     """
     container = GridContainer(source)
     if os.path.realpath(source) == os.path.realpath(path):
@@ -180,17 +169,9 @@ def _finish(file: BinaryIO, header: GridHeader, entries: Sequence[tuple[int, int
 class GridContainer(SectionFile):
     """A file of version 2; its header is checked against the size of the file.
 
-    Parameters
-    ----------
-    path : path
-        The file is opened for each read, and never held open.
-
-    Raises
-    ------
-    FormatError
-        If anything differs from the format; the message names the byte, the expected and the found value.
-    InputError
-        If the file cannot be read at all.
+    `path`: the file is opened for each read, and never held open. Raises `FormatError` if anything differs from the
+    format; the message names the byte, the expected and the found value. Raises `InputError` if the file cannot be read
+    at all.
     """
 
     version = VERSION
@@ -286,15 +267,8 @@ class GridContainer(SectionFile):
 class Preview(GridContainer):
     """The preview of a file, which is held in memory: a file of its own.
 
-    Parameters
-    ----------
-    whole : GridContainer
-        The file.
-
-    Raises
-    ------
-    FormatError
-        If anything differs from the format. Bytes count from where the preview begins.
+    `whole`: the file. Raises `FormatError` if anything differs from the format. Bytes count from where the preview
+    begins.
     """
 
     def __init__(self, whole: GridContainer) -> None:
@@ -365,12 +339,4 @@ def channel_bytes(
     return table
 
 
-__all__ = [
-    "GridContainer",
-    "Preview",
-    "channel_bytes",
-    "coded_size",
-    "trim_container",
-    "verify_grid",
-    "write_grid",
-]
+__all__ = ["GridContainer", "Preview", "channel_bytes", "coded_size", "trim_container", "verify_grid", "write_grid"]

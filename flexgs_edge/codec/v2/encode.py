@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,22 +11,109 @@ from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan
 from flexgs_edge.codec.v2.device.encode_kernels import CountKernel, encode_streams
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.fit_groups import fit_group
-from flexgs_edge.codec.v2.fit_levels import fit_levels
 from flexgs_edge.codec.v2.groups import Group
 from flexgs_edge.codec.v2.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.v2.ports import UNIFORM, Batch, CountPort, FitPort
 from flexgs_edge.codec.v2.rans import Encoder, lane_count
-from flexgs_edge.codec.v2.tables import merge_contexts
+from flexgs_edge.codec.v2.tables import CLASSES, LEVELS, OFTEN, WEIGHTS, level_batches, merge_contexts, to_levels
 from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds, walk_chunk, walk_positions
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.scene.curve import morton
+
+ROUNDS = 2  # How often levels are chosen, each time by what levels cost after the time before
+_UNSEEN = 0.25
+"""A change of levels that no table has yet costs as much as one that comes this often. It would need an entry of its own."""
+_UNIT = 2.0**-20
+"""Bits are counted in these units. Sums are then exact, and the last digit of a logarithm, in which machines differ, decides
+nothing."""
+
+
+def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Levels of all alphabets.
+
+    `counts`: for each alphabet, [t, a] i64, the symbols of each table; t is at least 1. Returns for each alphabet, [t,
+    a] u8. A symbol that was counted has a level above 0.
+    """
+    levels = [to_levels(rows) for rows in counts]
+    for _ in range(ROUNDS):
+        prices = _prices(levels)
+        levels = [_chosen(own, rows, prices) for own, rows in zip(levels, counts, strict=True)]
+    return levels
+
+
+def _in_units(bits: np.ndarray) -> np.ndarray:
+    whole: np.ndarray = np.rint(bits / _UNIT) * _UNIT
+    return whole
+
+
+def _prices(levels: Sequence[np.ndarray]) -> np.ndarray:
+    """[4, 65] f64, bits of each change of a level, for each class of levels."""
+    seen = np.full((CLASSES - 1, LEVELS), _UNSEEN)
+    for rows in levels:
+        for classes, changes in level_batches(rows):
+            np.add.at(seen, (classes, changes), 1)
+    return _in_units(np.log2(seen.sum(axis=1, keepdims=True)) - np.log2(seen))
+
+
+def _chosen(levels: np.ndarray, counts: np.ndarray, prices: np.ndarray) -> np.ndarray:
+    """Levels [t, a] of one alphabet, table by table, where `levels` are those of the round before."""
+    result = levels.copy()
+    for i, row in enumerate(counts):
+        if not row.any():
+            continue
+        bits = _symbol_bits(row, levels[i])
+        if i + 1 < len(counts):
+            bits += _change_bits(np.arange(LEVELS)[:, None], result[i + 1][None], prices)
+        if i:
+            bits += _change_bits(result[i - 1][None], np.arange(LEVELS)[:, None], prices)
+            result[i] = np.argmin(bits, axis=0)
+        else:
+            result[i] = cheapest_path(bits, prices[0])
+    return result
+
+
+def _symbol_bits(counts: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """[65, a] f64, bits of a table's symbols for each level that theirs might have, but for a constant.
+
+    Any weight makes all other symbols dearer. The tangent at the table's present sum of weights tells by how much.
+    """
+    dearer = counts.sum() / (WEIGHTS[levels].sum() * np.log(2))
+    bits: np.ndarray = (
+        _in_units(WEIGHTS * dearer)[:, None] - counts * _in_units(np.log2(np.maximum(WEIGHTS, 1)))[:, None]
+    )
+    bits[0, counts > 0] = np.inf
+    return bits
+
+
+def _change_bits(before: np.ndarray, levels: np.ndarray, prices: np.ndarray) -> np.ndarray:
+    """Bits of levels behind those of the table before."""
+    classes = 1 + (before > 0) + (before > OFTEN)
+    bits: np.ndarray = prices[classes, (levels.astype(np.int64) - before.astype(np.int64)) % LEVELS]
+    return bits
+
+
+def cheapest_path(bits: np.ndarray, prices: np.ndarray) -> np.ndarray:
+    """Levels [a] of a first table, where each is stored as its change from the symbol before (Viterbi 1967)."""
+    # Ways to a level lie side by side, since most of the time goes into finding the least of them.
+    changes = prices[(np.arange(LEVELS)[:, None] - np.arange(LEVELS)[None]) % LEVELS]
+    total, came = bits[:, 0] + changes[:, 0], []
+    ways, rows = np.empty_like(changes), LEVELS * np.arange(LEVELS)
+    for own in bits.T[1:]:
+        np.add(changes, total, ways)
+        came.append(ways.argmin(axis=1))
+        total = ways.take(rows + came[-1]) + own
+    path = [int(total.argmin())]
+    for back in reversed(came):
+        path.append(int(back[path[-1]]))
+    return np.array(path[::-1], np.uint8)
+
 
 SAMPLE_CHUNKS = 4
 """Chunks that the predictions are fitted to; the tables count the symbols of all chunks. With fewer, layers of a small file
@@ -85,12 +172,9 @@ class Encoded:
     chunks: list[Chunk]
     batches: list[list[Batch]]
     bits: np.ndarray
-    device: Device | None = None
-    """The device that codes the streams; None for NumPy."""
-    written: tuple[bytes, ...] | None = None
-    """The coded streams, if they are made already."""
-    threads: int | None = None
-    """Chunks that NumPy codes at once; None for as many as suit this machine."""
+    device: Device | None = None  # The device that codes the streams; None for NumPy
+    written: tuple[bytes, ...] | None = None  # The coded streams, if they are made already
+    threads: int | None = None  # Chunks that NumPy codes at once; None for as many as suit this machine
 
     @property
     def information(self) -> float:
@@ -129,24 +213,16 @@ class Encoded:
 
 def encode_grid(
     grid: GridScene,
-    chunk_rows: int = CHUNK_ROWS,
+    chunk_rows: int = CHUNK_ROWS,  # most rows of a chunk
     device: Device | None = None,
-    storage: Storage = IN_MEMORY,
+    storage: Storage = IN_MEMORY,  # holds the symbols: two or three bytes a code beside the grid
     threads: int | None = None,
 ) -> Encoded:
     """Fit a model to a scene and count its symbols; `Encoded.streams` then codes the chunks.
 
-    Parameters
-    ----------
-    grid : GridScene
-    chunk_rows : int
-        Most rows of a chunk.
-    device : Device, optional
-        Counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
-    storage : Storage
-        Holds the symbols: two or three bytes a code beside the grid.
-    threads : int, optional
-        Groups that are fitted at once, and chunks that NumPy codes at once. Default: as many as suit this machine.
+    `device`: counts the symbols, with the same result. It takes a kilobyte for each row of the chunks in work.
+    `threads`: groups that are fitted at once, and chunks that NumPy codes at once. Default: as many as suit this
+    machine.
     """
     cells, low, depth = cells_of(grid, storage)
     layers = np.bincount(grid.layer, minlength=1).tolist()

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-EXACT = float(1 << 23)
-"""Sums below this bound are exact in float32, also with halves of 2^16 added."""
+EXACT = float(1 << 23)  # Sums below this bound are exact in float32, also with halves of 2^16 added
 _PRODUCT = 1 << 17
 """Products of one matrix product. From twice as many, OpenBLAS starts threads, which cost more than they save."""
 
@@ -20,17 +19,8 @@ _PRODUCT = 1 << 17
 class Features:
     """Features of all rows, and a bound on each feature.
 
-    Parameters
-    ----------
-    width, count : int
-        Number of features and of rows.
-
-    Attributes
-    ----------
-    values : np.ndarray
-        [width, count] f32, integers in 1/256.
-    largest : np.ndarray
-        [width] f64, the largest magnitude of each feature.
+    `width`, `count`: number of features and of rows. `values`: [width, count] f32, integers in 1/256. `largest`:
+    [width] f64, the largest magnitude of each feature.
     """
 
     def __init__(self, width: int, count: int) -> None:

@@ -19,20 +19,17 @@ SPREAD_BUCKETS = 5
 their tables cost: docs/results/tuning.md#codec"""
 RESIDUAL_BUCKETS = 12
 """Contexts of a group of residuals: 12 of the predicted error times 2, the side that the prediction is rounded to."""
-ALL_BUCKETS = 1 << 15
-"""A group of fewer values has fewer contexts, by the cube root: docs/results/tuning.md#levels"""
+ALL_BUCKETS = 1 << 15  # A group of fewer values has fewer contexts, by the cube root: docs/results/tuning.md#levels
 SYMBOL_ROOM = 192
 """Most symbols of a fitted alphabet. For more values, the low bits are coded raw, and the alphabet stays short."""
-_RARE = 2000
-"""One in so many values may lie outside the alphabet at either end; such an escape costs 32 more bits."""
+_RARE = 2000  # One in so many values may lie outside the alphabet at either end; such an escape costs 32 more bits
 _RARE_FEW = 8
 """If values are few, up to 8 of them, but at most one in 50, may lie outside: one outlier must not widen the
 alphabet."""
 _FAR = 4
 """The fit leaves out samples with a number so many times beyond the usual ones: one of them would outweigh the rest."""
 
-Sample = tuple[np.ndarray, np.ndarray]
-"""Features ([f, m] f32, integers in 1/256) and codes ([m] integers)."""
+Sample = tuple[np.ndarray, np.ndarray]  # Features ([f, m] f32, integers in 1/256) and codes ([m] integers)
 
 
 def fit_group(kind: GroupKind, samples: Sequence[Sample]) -> Group:

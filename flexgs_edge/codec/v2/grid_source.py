@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,13 +19,12 @@ from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.on_grid import grid_comment
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
-DECODE_BYTES = 800
-"""Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums."""
+GRID_COMMENT = "flexgs-edge grid "  # Begins the comment in a PLY that names the step sizes of its values
+DECODE_BYTES = 800  # Bound on the bytes per row while NumPy decodes a chunk: codes, features, neighbours' weights, sums
 _ROTATION_STEP_MOST = 2.0**38
 """Bound up to which three squares of a rotation code (24 bits) times its step stay finite in float32."""
 
@@ -32,22 +32,8 @@ _ROTATION_STEP_MOST = 2.0**38
 class GridSource(SceneSource):
     """A `.fgs` file of version 2 as a scene.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    container : GridContainer, optional
-        The file, if it is open, or its `Preview`.
-
-    Attributes
-    ----------
-    settings : dict
-        How the file was made.
-
-    Raises
-    ------
-    FormatError
-        If the file differs from the format; a damaged chunk raises it when it is read.
+    `path`: the file. `container`: the file, if it is open, or its `Preview`. `settings`: how the file was made. Raises
+    `FormatError` if the file differs from the format; a damaged chunk raises it when it is read.
     """
 
     def __init__(self, path: str | os.PathLike[str], container: GridContainer | None = None) -> None:
@@ -64,7 +50,7 @@ class GridSource(SceneSource):
         colour = CODE_LIMIT * max(steps.dc, *steps.sh, 0.0) * (1 + steps.chroma)
         self.valid = steps.rotation <= _ROTATION_STEP_MOST and colour <= SH_LARGEST
         self.settings: dict[str, Any] = header.settings
-        self.comments = (grid_comment(header.grid_steps),)
+        self.comments = (GRID_COMMENT + json.dumps(header.grid_steps.to_json()),)
         self._model = self.container.read_model()
         self._entries = self.container.read_table()
         self._chunks = header.chunks()
@@ -137,12 +123,8 @@ class GridSource(SceneSource):
     def on_device(self, device: Device, chunks: int) -> Iterator[None]:
         """Decode on a device inside this context, several chunks at once; the results are the same.
 
-        Parameters
-        ----------
-        device : Device
-            A kernel backend whose work-items run as threads of a processor.
-        chunks : int
-            Chunks decoded at once; see `device_bytes` for their memory.
+        `device`: a kernel backend whose work-items run as threads of a processor. `chunks`: chunks decoded at once; see
+        `device_bytes` for their memory.
         """
         longest = max((entry.section.length for entry in self._entries), default=0)
         self._kernel = ChunkKernel(device, self._model, self._most_rows, longest, chunks)
@@ -179,10 +161,7 @@ class GridSource(SceneSource):
     def whole_in_order(self, threads: int) -> Iterator[None]:
         """Decode chunks ahead inside this context, in which all fields of all rows are read from first to last.
 
-        Parameters
-        ----------
-        threads : int
-            Chunks that are held beside the current one; 1 decodes none ahead. A device decodes one group ahead.
+        `threads`: chunks that are held beside the current one; 1 decodes none ahead. A device decodes one group ahead.
         """
         if self._kernel is not None:
             self._tables = in_order(self._tables_of, self._groups(), 1, always=True)

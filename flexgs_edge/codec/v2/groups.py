@@ -17,53 +17,27 @@ _HEAD = struct.Struct("<iBiHBBB")
 
 @dataclass(frozen=True)
 class GroupKind:
-    """The properties of a group that the format fixes.
+    """The properties of a group that the format fixes."""
 
-    Parameters
-    ----------
-    name : str
-        For reports and error messages.
-    features : int
-        Number of features of its prediction.
-    residual : bool
-        Symbols are differences from the prediction; if False, they are the values.
-    sh : bool
-        A scene without SH does not have this group.
-    """
-
-    name: str
-    features: int
-    residual: bool
-    sh: bool
+    name: str  # for reports and error messages
+    features: int  # number of features of its prediction
+    residual: bool  # symbols are differences from the prediction; if False, they are the values
+    sh: bool  # a scene without SH does not have this group
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """A group with its fitted numbers.
-
-    Parameters
-    ----------
-    centre : int
-        Added to every prediction.
-    low : int
-        Code of symbol 0.
-    shift : int
-        Number of low bits that are coded raw.
-    symbols : int
-        Size of the alphabet. The last symbol is the escape, unless nothing was escaped.
-    weights : np.ndarray
-        [2, features + 1] i16, in 1/256: weights of the value, then of the size of the error; the constant comes last.
-    cuts : tuple of np.ndarray
-        Two lists of thresholds, [<= 15] i32 each, ascending: of the predicted value in 1/16, and of the predicted error
-        in 1/64. The first list is empty for residuals: the side of the rounding takes its place.
-    """
+    """A group with its fitted numbers."""
 
     kind: GroupKind
-    centre: int
-    low: int
-    shift: int
-    symbols: int
+    centre: int  # added to every prediction
+    low: int  # code of symbol 0
+    shift: int  # number of low bits that are coded raw
+    symbols: int  # Size of the alphabet. The last symbol is the escape, unless nothing was escaped.
+    # [2, features + 1] i16, in 1/256: weights of the value, then of the size of the error; the constant comes last.
     weights: np.ndarray
+    # Two lists of thresholds, [<= 15] i32 each, ascending: of the predicted value in 1/16, and of the predicted error
+    # in 1/64. The first list is empty for residuals: the side of the rounding takes its place.
     cuts: tuple[np.ndarray, np.ndarray]
 
     @property
@@ -88,19 +62,9 @@ class Group:
     def predict(self, known: Sums, rows: slice, own: Sequence[np.ndarray]) -> tuple[np.ndarray | float, np.ndarray]:
         """Predict the codes of some rows.
 
-        Parameters
-        ----------
-        known : Sums
-            From `known`, for all rows.
-        rows : slice
-            The rows to predict.
-        own : sequence of np.ndarray
-            Mean and spread of the rows' neighbours, [m] f32 each; empty in the first pass.
-
-        Returns
-        -------
-        tuple
-            The base to subtract from the codes ([m] f32 or f64, or one number), and the contexts ([m] u8).
+        `known`: from `known`, for all rows. `rows`: the rows to predict. `own`: mean and spread of the rows'
+        neighbours, [m] f32 each; empty in the first pass. Returns the base to subtract from the codes ([m] f32 or f64,
+        or one number), and the contexts ([m] u8).
         """
         mean, error = add_own(known, rows, self.weights[:, :2].astype(np.float64), own)
         # If float32 rounds a threshold, the threshold lies beyond every sum that float32 holds.

@@ -19,16 +19,39 @@ from flexgs_edge.codec.header import (
     parse_json,
     shown,
 )
-from flexgs_edge.codec.v2.channels import COUNT_MOST, Channels, channel_parts
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 
+COUNT_MOST = 2**53 - 1  # Largest number of bytes or rows: every JSON reader keeps integers up to here exactly
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Bytes of each kind in `channel_parts`, rounded, and the number of rows with SH of at least degree 1, 2 and so on."""
+
+    bytes: tuple[int, ...]
+    rows: tuple[int, ...]
+
+    @classmethod
+    def of(cls, taken: Mapping[str, float], rows: Sequence[int]) -> Channels:
+        """Make the record from the bytes of each alphabet (as in `channel_bytes`) and the rows of each degree from 1 on."""
+        parts = channel_parts(len(rows)).values()
+        return cls(tuple(round(sum(taken[part] for part in some)) for some in parts), tuple(map(int, rows)))
+
+
+def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
+    """The kinds of value in version 2, and the alphabets of each."""
+    parts: dict[str, tuple[str, ...]] = {"position": ("position", "repeats")}
+    parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
+    parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}
+    return parts | {f"sh {d}": tuple(f"sh {d} {c}" for c in ("Y", "Co", "Cg")) for d in range(1, sh_degree + 1)}
+
+
 HEADER_MOST = 1 << 20
-MODEL_MOST = 1 << 20
-"""Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less."""
+MODEL_MOST = 1 << 20  # Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less
 LAYERS_MOST = 256
 PREVIEW_MOST = 1 << 24
 PREVIEW_KEY = len(',"preview_bytes":16777216')
@@ -54,47 +77,23 @@ _OPTIONAL = "channels", "preview_bytes"
 class GridHeader:
     """The header of a version 2 file.
 
-    Parameters
-    ----------
-    count, sh_degree : int
-        As in `GridScene`.
-    origin : tuple of float
-        World position that positions are relative to.
-    steps : dict
-        The step sizes, from `StepSizes.to_json`.
-    layers : tuple of int
-        Rows of each layer.
-    chunk_rows : int
-        Rows of a chunk; the last chunk of a layer may have fewer.
-    depth : int
-        Levels of the octrees.
-    low : tuple of int
-        Position code of the octrees' first cell.
-    model_bytes : int
-        Bytes of the model.
-    settings : dict
-        How the file was made.
-    cut_from : dict or None
-        `bytes`, `count` and `layers` of the file that this one was cut from.
-    channels : Channels or None
-        Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
-    preview_bytes : int or None
-        Bytes of the preview, a small file of the same scene; None if there is none.
+    `count`, `sh_degree`: as in `GridScene`.
     """
 
     count: int
     sh_degree: int
-    origin: tuple[float, float, float]
-    steps: dict[str, Any]
-    layers: tuple[int, ...]
-    chunk_rows: int
-    depth: int
-    low: tuple[int, int, int]
-    model_bytes: int
-    settings: dict[str, Any]
-    cut_from: dict[str, int] | None = None
+    origin: tuple[float, float, float]  # world position that positions are relative to
+    steps: dict[str, Any]  # the step sizes, from `StepSizes.to_json`
+    layers: tuple[int, ...]  # rows of each layer
+    chunk_rows: int  # rows of a chunk; the last chunk of a layer may have fewer
+    depth: int  # levels of the octrees
+    low: tuple[int, int, int]  # position code of the octrees' first cell
+    model_bytes: int  # bytes of the model
+    settings: dict[str, Any]  # how the file was made
+    cut_from: dict[str, int] | None = None  # `bytes`, `count` and `layers` of the file that this one was cut from
+    # Sizes that readers need not decode chunks for; None in files that were cut, and in files of early writers.
     channels: Channels | None = None
-    preview_bytes: int | None = None
+    preview_bytes: int | None = None  # bytes of the preview, a small file of the same scene; None if there is none
     block: int = 0
     version: int = 2
 

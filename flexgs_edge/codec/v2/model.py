@@ -14,36 +14,24 @@ from flexgs_edge.codec.v2.tables import decode_tables, encode_tables, from_level
 from flexgs_edge.codec.v2.walk import base_kinds, sh_kinds
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
 
-REPEATS_MOST = 16
-"""Symbols of the alphabet of repeats; the last one is the escape."""
-SHARED = 2
-"""Alphabets that come before those of the groups: the octree's and that of the repeats."""
+REPEATS_MOST = 16  # Symbols of the alphabet of repeats; the last one is the escape
+SHARED = 2  # Alphabets that come before those of the groups: the octree's and that of the repeats
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """Everything that a decoder needs besides the stream of a chunk.
 
-    Parameters
-    ----------
-    sh_degree, depth : int
-        SH degree of the scene, and depth of its octree.
-    groups : list of Group
-        Base channels, then SH.
-    mappings : list of np.ndarray
-        For each alphabet, [contexts] u8, the table of every context; alphabets are the octree, the repeats, the groups.
-    levels : list of np.ndarray
-        For each alphabet, [tables, symbols] u8, the frequencies as the file stores them.
-    tables : list of Tables
-        For each alphabet, its frequency tables.
+    `sh_degree`, `depth`: SH degree of the scene, and depth of its octree.
     """
 
     sh_degree: int
     depth: int
-    groups: list[Group]
+    groups: list[Group]  # base channels, then SH
+    # For each alphabet, [contexts] u8, the table of every context; alphabets are the octree, the repeats, the groups.
     mappings: list[np.ndarray]
-    levels: list[np.ndarray]
-    tables: list[Tables]
+    levels: list[np.ndarray]  # for each alphabet, [tables, symbols] u8, the frequencies as the file stores them
+    tables: list[Tables]  # for each alphabet, its frequency tables
 
     @cached_property
     def slots(self) -> list[np.ndarray]:

@@ -29,21 +29,8 @@ def walk_octree(depth: int, rows: int, code: Code, cells: np.ndarray | None = No
     Bit c of a node's byte is set if child c is occupied, where c is the next three bits of the Morton index. Nodes come
     in Morton order, and each level is one batch.
 
-    Parameters
-    ----------
-    depth : int
-        0 to 21.
-    rows : int
-        Most nodes of a level.
-    code : callable
-        Codes a batch.
-    cells : np.ndarray, optional
-        [m] u64 Morton indices, ascending without repeats; None to decode.
-
-    Returns
-    -------
-    np.ndarray
-        [m] u64 Morton indices of the occupied cells, ascending.
+    `depth`: 0 to 21. `rows`: most nodes of a level. `code`: codes a batch. `cells`: [m] u64 Morton indices, ascending
+    without repeats; None to decode. Returns [m] u64 Morton indices of the occupied cells, ascending.
     """
     nodes = np.zeros(1, np.uint64)
     children = np.zeros(1, np.uint8)  # for each node, the number of its parent's children

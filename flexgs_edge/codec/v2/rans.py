@@ -43,10 +43,7 @@ class StreamError(ValueError):
 class Tables:
     """Frequency tables of one alphabet.
 
-    Parameters
-    ----------
-    freqs : np.ndarray
-        [t, a] integers: t tables of a <= 2^16 symbols. Every row adds up to 2^14.
+    `freqs`: [t, a] integers: t tables of a <= 2^16 symbols. Every row adds up to 2^14.
     """
 
     def __init__(self, freqs: np.ndarray) -> None:
@@ -96,10 +93,7 @@ class Tables:
 class Encoder:
     """Collects batches of symbols in decoding order, and codes them backwards.
 
-    Parameters
-    ----------
-    lanes : int
-        From `lane_count`.
+    `lanes`: from `lane_count`.
     """
 
     def __init__(self, lanes: int) -> None:
@@ -187,12 +181,7 @@ def first_states(data: bytes, lanes: int) -> np.ndarray:
 class Decoder:
     """Decodes the batches of an `Encoder` in order.
 
-    Parameters
-    ----------
-    data : bytes
-        The stream, and padding that may follow it.
-    lanes : int
-        As in the encoder.
+    `data`: the stream, and padding that may follow it. `lanes`: as in the encoder.
     """
 
     def __init__(self, data: bytes, lanes: int) -> None:

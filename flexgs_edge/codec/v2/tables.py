@@ -26,16 +26,9 @@ WEIGHTS = np.array([0] + [(4 + (v - 1) % 4) << ((v - 1) // 4) for v in range(1, 
 def merge_contexts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Merge contexts greedily as long as it saves bits: symbols cost more, but fewer frequencies are stored.
 
-    Parameters
-    ----------
-    counts : np.ndarray
-        [c, a] i64, symbols counted in each context.
-
-    Returns
-    -------
-    tuple of np.ndarray
-        [c] u8, the table of each context, and [t, a] i64, the counts of each table; t is 0 if no symbol was counted.
-        Tables are numbered by their first context. A context without symbols takes the first table.
+    `counts`: [c, a] i64, symbols counted in each context. Returns [c] u8, the table of each context, and [t, a] i64,
+    the counts of each table; t is 0 if no symbol was counted. Tables are numbered by their first context. A context
+    without symbols takes the first table.
     """
     used = np.flatnonzero(counts.any(axis=1))
     merged = np.array(counts[used], np.int64)
@@ -96,12 +89,7 @@ def level_batches(levels: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) -> bytes:
     """Code the mappings and levels of all alphabets in one small stream.
 
-    Parameters
-    ----------
-    mappings : sequence of np.ndarray
-        For each alphabet, [c] u8, the table of each context.
-    levels : sequence of np.ndarray
-        For each alphabet, [t, a] u8.
+    `mappings`: for each alphabet, [c] u8, the table of each context. `levels`: for each alphabet, [t, a] u8.
     """
     batches = []
     for mapping, rows in zip(mappings, levels, strict=True):
@@ -122,12 +110,7 @@ def encode_tables(mappings: Sequence[np.ndarray], levels: Sequence[np.ndarray]) 
 def decode_tables(data: bytes, shapes: Sequence[tuple[int, int]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Inverse of `encode_tables`: (mapping, levels) of each alphabet; raises `StreamError` for damaged data.
 
-    Parameters
-    ----------
-    data : bytes
-        Nothing may follow the stream.
-    shapes : sequence of tuple
-        Number of contexts and of symbols, for each alphabet.
+    `data`: nothing may follow the stream. `shapes`: number of contexts and of symbols, for each alphabet.
     """
     meta, at = np.zeros((CLASSES, LEVELS), np.uint8), 0
     for row in meta:

@@ -11,8 +11,7 @@ from typing import TypeVar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-THREADS_MOST = 2
-"""Most chunks in work at once. Each takes memory, and more than two wait for the interpreter's lock."""
+THREADS_MOST = 2  # Most chunks in work at once. Each takes memory, and more than two wait for the interpreter's lock.
 
 
 def thread_count(chunks: int) -> int:

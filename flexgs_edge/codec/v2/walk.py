@@ -11,19 +11,113 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.codec.v2.contexts import ONE, REACH, Plan, limited, neighbour_features, plan_passes
 from flexgs_edge.codec.v2.features import Features, Term
 from flexgs_edge.codec.v2.groups import GroupKind
 from flexgs_edge.codec.v2.octree import unmorton, walk_octree
 from flexgs_edge.codec.v2.rans import StreamError
-from flexgs_edge.constants import VALUE_LIMIT
+from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
+
+REACH = (4, 2)
+"""Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which
+saves time and costs few bits: docs/results/tuning.md#codec"""
+ONE = 256  # Features are integers in units of 1/256 of a code
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """Rows of one pass, and their neighbours."""
+
+    rows: slice  # the rows, with a step
+    known: slice  # the rows decoded before
+    # [2 * reach, m] f32 weights of the neighbours, with a sum of about 256; None for the first pass.
+    weights: np.ndarray | None
+    stride: int = 1  # `rows` holds one in so many rows of the pass; 1 for all
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All passes, and a feature of each row: 256 * bits of the squared distance to the nearest neighbour (0 in the first)."""
+
+    passes: list[Pass]
+    near: Features
+
+
+def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
+    """Plan the passes over the rows of a chunk.
+
+    `position`: [3, n], integer cells. `reach`: neighbours on each side. `stride`: take a sample of one in so many rows
+    of each pass; 1 by default, for all rows.
+    """
+    count = position.shape[1]
+    near = Features(1, count)
+    if count == 0:
+        return Plan([], near)
+    top = max((count - 1) // COARSE_ROWS, 0).bit_length()
+    points = np.ascontiguousarray(position, np.float32)
+    passes = [Pass(slice(0, count, stride << top), slice(0, 0), None, stride)]
+    for k in range(top - 1, -1, -1):
+        rows, known = slice(1 << k, count, (2 << k) * stride), slice(0, count, 2 << k)
+        here = points[:, rows]
+        squares = np.zeros((2 * reach, here.shape[1]), np.float32)
+        for axis in range(3):
+            away = _neighbours(points[axis, known], here.shape[1], reach, stride) - here[axis]
+            away *= away
+            squares += away
+        bits = np.frexp(squares.min(axis=0) + np.float32(1))[1]
+        near.values[0, rows] = bits * np.float32(ONE)
+        squares += np.float32(1)
+        np.divide(np.float32(1), squares, out=squares)
+        total = squares[0].copy()
+        for square in squares[1:]:
+            total += square
+        squares *= np.float32(ONE) / total
+        passes.append(Pass(rows, known, np.rint(squares, out=squares), stride))
+    near.seal()
+    return Plan(passes, near)
+
+
+def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
+    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1.
+
+    The ends are repeated.
+    """
+    padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
+    # Overlapping views of one array; as_strided does the same, but slowly.
+    step = padded.itemsize
+    return np.ndarray((2 * reach, count), padded.dtype, padded, 0, (step, stride * step))
+
+
+def neighbour_features(values: np.ndarray, step: Pass) -> tuple[np.ndarray, ...]:
+    """Weighted mean and spread of the neighbours in a pass, each [m] f32 in 1/256; an empty tuple in the first pass.
+
+    `values`: [n] f32 values of the channel; those at `step.known` are decoded. `step`: the pass.
+    """
+    if step.weights is None:
+        return ()
+    reach, count = len(step.weights) // 2, step.weights.shape[1]
+    there = _neighbours(values[step.known], count, reach, step.stride)
+    # All products and sums are integers that float32 holds, so their order does not matter.
+    parts = step.weights * there
+    mean = np.add.reduce(parts, axis=0)
+    middle = mean * np.float32(1 / ONE)
+    middle += np.float32(0.5)
+    np.floor(middle, middle)
+    np.subtract(there, middle, parts)
+    np.abs(parts, parts)
+    parts *= step.weights
+    return mean, np.add.reduce(parts, axis=0)
+
+
+def limited(values: np.ndarray) -> np.ndarray:
+    """Clip values [n] to the range that predictions use, as f32."""
+    kept: np.ndarray = values.astype(np.float32)
+    return np.clip(kept, np.float32(-VALUE_LIMIT), np.float32(VALUE_LIMIT), out=kept)
+
 
 AXES = ("x", "y", "z")
 COLOURS = ("Y", "Co", "Cg")
-_OWN = 3
-"""Number of features from the channel's own neighbours: mean, spread and distance."""
-_NEAR = (2,)
-"""Place of the distance's weight."""
+_OWN = 3  # Number of features from the channel's own neighbours: mean, spread and distance
+_NEAR = (2,)  # Place of the distance's weight
 
 _SCALES = ("scale x", "scale y", "scale z")
 _EARLIER: dict[str, tuple[str, ...]] = {
@@ -38,8 +132,7 @@ _EARLIER: dict[str, tuple[str, ...]] = {
     "rotation x": _SCALES,
     "rotation y": _SCALES,
     "rotation z": _SCALES,
-}
-"""Base channels in order, and the earlier channels that predict each of them."""
+}  # Base channels in order, and the earlier channels that predict each of them
 _SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
 """Channels that predict others. Each gives three features in this order: value, neighbours' mean, distance."""
 _SH_SOURCES = ("opacity", *_SCALES)
@@ -77,8 +170,7 @@ class ChunkCodes:
     cells: np.ndarray  # [r] u64, Morton index of every row's cell
     base: dict[str, np.ndarray]  # each [r]
     sh: tuple[np.ndarray, ...]
-    coordinates: np.ndarray | None = None
-    """[3, r] i32, coordinates of the cells, if a decoder has made them."""
+    coordinates: np.ndarray | None = None  # [3, r] i32, coordinates of the cells, if a decoder has made them
 
     @property
     def position(self) -> np.ndarray:
@@ -92,8 +184,7 @@ class Port(Protocol):
     The port chooses the type `known` returns.
     """
 
-    stride: int
-    """One in so many rows of each pass is coded."""
+    stride: int  # One in so many rows of each pass is coded
 
     def occupancy(self, contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         """Code the bytes of octree nodes."""
@@ -115,25 +206,9 @@ def walk_chunk(
 ) -> ChunkCodes:
     """Code a chunk.
 
-    Parameters
-    ----------
-    rows : int
-        Rows of the chunk.
-    depth : int
-        Depth of the octree.
-    sh_degree : int
-        SH degree of the scene.
-    port : Port
-        Codes the batches.
-    codes : ChunkCodes, optional
-        Codes to encode; None to decode.
-    base_only : bool
-        Stop before the SH.
-
-    Returns
-    -------
-    ChunkCodes
-        The codes; without SH if `base_only`.
+    `rows`: rows of the chunk. `depth`: depth of the octree. `sh_degree`: SH degree of the scene. `port`: codes the
+    batches. `codes`: codes to encode; None to decode. `base_only`: stop before the SH. Returns the codes; without SH if
+    `base_only`.
     """
     cells = walk_positions(rows, depth, port, codes)
     position = unmorton(cells)
@@ -169,13 +244,7 @@ def walk_chunk(
 
 
 def _walk_channel(
-    group: int,
-    known: Any,
-    port: Port,
-    plan: Plan,
-    rows: int,
-    source: np.ndarray | None,
-    mean: np.ndarray | None = None,
+    group: int, known: Any, port: Port, plan: Plan, rows: int, source: np.ndarray | None, mean: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Code one channel: codes [rows] i32 and values [rows] f32. The neighbours' means are written into `mean`."""
     if source is None:

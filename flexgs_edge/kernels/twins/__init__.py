@@ -22,12 +22,7 @@ from flexgs_edge.kernels.twins.descend import descend, follow, snap
 from flexgs_edge.kernels.twins.flip import flip_colours, flip_columns, flip_pair, flip_rows
 from flexgs_edge.kernels.twins.project import project
 from flexgs_edge.kernels.twins.score import add_costs, residual, sh_residual
-from flexgs_edge.kernels.twins.similarity import (
-    dssim_residual,
-    dssim_slopes,
-    ssim_columns,
-    ssim_rows,
-)
+from flexgs_edge.kernels.twins.similarity import dssim_residual, dssim_slopes, ssim_columns, ssim_rows
 from flexgs_edge.kernels.twins.sort import (
     exclusive_scan,
     sort_count,

@@ -9,10 +9,8 @@ import numpy as np
 from flexgs_edge.constants import EXP2_HIGH, EXP2_LOW, EXP2_MAGIC, EXP2_POLY, LOG2_ALPHA_MAX, LOG2_PIVOT, LOG2_POLY
 
 f32 = np.float32
-Values = Union[np.ndarray, "np.floating[Any]"]
-"""An array of float32, or one float32."""
-Triple = tuple[np.ndarray, ...]
-"""x, y and z of several rows."""
+Values = Union[np.ndarray, "np.floating[Any]"]  # An array of float32, or one float32
+Triple = tuple[np.ndarray, ...]  # x, y and z of several rows
 
 _TIE_BITS = np.int64(0x1FFFFFFF)
 _TIE = np.int64(0x10000000)

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.constants import (
-    FACTOR_MIN,
-    FIXED_MOMENT,
-    FIXED_WEIGHT,
-    LOG2_E,
-    SH_C0,
-    SH_C1,
-    SH_C2,
-    SH_C3,
-    SH_C4,
-)
+from flexgs_edge.constants import FACTOR_MIN, FIXED_MOMENT, FIXED_WEIGHT, LOG2_E, SH_C0, SH_C1, SH_C2, SH_C3, SH_C4
 from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, fma
 from flexgs_edge.kernels.twins.project import sh_basis
 

@@ -78,8 +78,7 @@ PLANES = {
     3: ("weight", "red", "green", "blue"),
     4: ("weight", "red", "green", "blue", "error", "square"),
     5: ("red", "green", "blue", "slope", "x", "y", "xx", "xy", "yy"),
-}
-"""Planes of the fixed-point sums, for each kind of statistics."""
+}  # Planes of the fixed-point sums, for each kind of statistics
 
 
 UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][4:], FIXED_MOMENT)

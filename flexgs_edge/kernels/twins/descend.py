@@ -16,16 +16,11 @@ def _pull(away: np.ndarray, price: np.float32, width: np.float32) -> np.ndarray:
 
 
 def price_bits(
-    degree: int,
-    prices: np.ndarray,
-    degrees: np.ndarray,
-    pace: np.ndarray,
-    values: np.ndarray,
-    gradient: np.ndarray,
+    degree: int, prices: np.ndarray, degrees: np.ndarray, pace: np.ndarray, values: np.ndarray, gradient: np.ndarray
 ) -> None:
     """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
 
-    `prices` is the record of `flexgs_edge.methods.best.refit.prices.bit_prices`.
+    `prices` is the record of `flexgs_edge.methods.best.refit.descent.bit_prices`.
     """
     rows = np.flatnonzero(pace > 0)
     own = values[:, rows]

@@ -8,8 +8,7 @@ from flexgs_edge.constants import BLOCK, SPAN_SLACK, SPAN_SLACK_RELATIVE, TILE
 from flexgs_edge.kernels.twins.arithmetic import f32, fma
 from flexgs_edge.kernels.twins.sort import block_of
 
-EMPTY = (1 << 28, -1)
-"""First and last block column of a row that the splat does not touch."""
+EMPTY = (1 << 28, -1)  # First and last block column of a row that the splat does not touch
 _BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
 
 

@@ -26,17 +26,10 @@ class BitModel:
 
     The defaults are fixed. Asking the coder for its own bits near the answer takes time and does not make files smaller:
     docs/results/tuning.md#bitmodel
-
-    Parameters
-    ----------
-    base : float
-        Bits of a Gaussian without SH.
-    bands : tuple of float
-        Bits that each SH degree from 1 adds.
     """
 
-    base: float = 50.0
-    bands: tuple[float, ...] = (10.0, 8.0, 8.0, 8.0)
+    base: float = 50.0  # bits of a Gaussian without SH
+    bands: tuple[float, ...] = (10.0, 8.0, 8.0, 8.0)  # bits that each SH degree from 1 adds
 
     def of_degree(self, degree: int) -> float:
         """Bits of a Gaussian kept with SH up to `degree`."""
@@ -48,19 +41,8 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
 
     Gaussians that no pose sees stay, without SH, because no cost of theirs is known.
 
-    Parameters
-    ----------
-    costs : RemovalCosts
-        Squared errors.
-    bits : BitModel
-        Bits of a Gaussian by SH degree.
-    multiplier : float
-        Squared error that a bit is worth.
-
-    Returns
-    -------
-    tuple of np.ndarray
-        [n] bool kept, [n] u8 SH degree kept.
+    `costs`: squared errors. `bits`: bits of a Gaussian by SH degree. `multiplier`: squared error that a bit is worth.
+    Returns [n] bool kept, [n] u8 SH degree kept.
     """
     top, count = len(costs.sh), len(costs.removal)
     keep, degrees = np.empty(count, bool), np.empty(count, np.uint8)
@@ -76,12 +58,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
 def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
     """Keep the row whose removal costs most (of equal ones the first), if `keep` has none that a pose sees.
 
-    Parameters
-    ----------
-    keep : np.ndarray
-        [n] bool, from `choose` or `choose_one_degree`; changed in place.
-    costs : RemovalCosts
-        Squared errors.
+    `keep`: [n] bool, from `choose` or `choose_one_degree`; changed in place. `costs`: squared errors.
     """
     dearest, most = 0, -1.0
     for rows, (removal, weight2) in read_ahead(len(keep), costs.removal, costs.weight2):
@@ -97,14 +74,8 @@ def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
 def keep_most(keep: np.ndarray, costs: RemovalCosts, most: int) -> None:
     """Keep no more than `most` rows: first go those that no pose sees, then those whose removal costs least.
 
-    Parameters
-    ----------
-    keep : np.ndarray
-        [n] bool, from `choose` or `choose_one_degree`; changed in place.
-    costs : RemovalCosts
-        Squared errors.
-    most : int
-        Most rows.
+    `keep`: [n] bool, from `choose` or `choose_one_degree`; changed in place. `costs`: squared errors. `most`: most
+    rows.
     """
     over = int(np.count_nonzero(keep)) - most
     if over > 0:
@@ -129,34 +100,16 @@ def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) ->
 
 
 def drop_bands(
-    planes: dict[str, np.ndarray],
-    rows: np.ndarray,
-    degrees: np.ndarray,
-    sh_mean: np.ndarray,
-    y0: float,
-    storage: Storage = IN_MEMORY,
+    planes: dict[str, np.ndarray],  # [width, n] f32 by field; not changed
+    rows: np.ndarray,  # [m] i64, ascending
+    degrees: np.ndarray,  # [m] u8, the SH degree that each row keeps
+    sh_mean: np.ndarray,  # [D, 3, n] f32, mean colour of the bands above each lower degree
+    y0: float,  # value of the constant basis function
+    storage: Storage = IN_MEMORY,  # where the new arrays live
 ) -> dict[str, np.ndarray]:
     """Take rows of planes and drop the SH above their degrees; the mean colour of these is added to the constant.
 
-    Parameters
-    ----------
-    planes : dict
-        [width, n] f32 by field; not changed.
-    rows : np.ndarray
-        [m] i64, ascending.
-    degrees : np.ndarray
-        [m] u8, the SH degree that each row keeps.
-    sh_mean : np.ndarray
-        [D, 3, n] f32, mean colour of the bands above each lower degree.
-    y0 : float
-        Value of the constant basis function.
-    storage : Storage
-        Where the new arrays live.
-
-    Returns
-    -------
-    dict
-        [width, m] f32 by field, in arrays of `storage`.
+    Returns [width, m] f32 by field, in arrays of `storage`.
     """
     top = len(sh_mean)
     if top == 0:

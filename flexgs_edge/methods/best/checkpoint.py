@@ -25,17 +25,13 @@ from flexgs_edge.scene.fields import FIELD
 
 LOG = logging.getLogger("flexgs_edge")
 
-DONE = "done"
-"""File that is written last. A round without it was cut short."""
+DONE = "done"  # File that is written last. A round without it was cut short.
 
 
 class Checkpoint:
     """A folder with one folder for each finished round of a search.
 
-    Parameters
-    ----------
-    folder : path
-        Made if missing. Its name holds the fingerprint of the search.
+    `folder`: made if missing. Its name holds the fingerprint of the search.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -65,10 +61,7 @@ class Checkpoint:
     def load(self, number: int, storage: Storage) -> dict[str, np.ndarray]:
         """The arrays of a finished round, by name, in `storage`.
 
-        Raises
-        ------
-        InputError
-            When a file is damaged.
+        Raises `InputError` when a file is damaged.
         """
         arrays = {}
         for place in sorted(self._place(number).glob("*.npy")):
@@ -85,10 +78,7 @@ class Checkpoint:
     def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
         """Save a round. Remains of an earlier run are written over.
 
-        Raises
-        ------
-        BudgetError
-            When the disk is full.
+        Raises `BudgetError` when the disk is full.
         """
         place = self._place(number)
         shutil.rmtree(place, ignore_errors=True)

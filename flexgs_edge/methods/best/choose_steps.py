@@ -41,15 +41,10 @@ So equal slopes ask for sqrt(6) and 2."""
 
 @dataclass(frozen=True)
 class Slopes:
-    """How fast errors grow with step sizes of geometry.
+    """How fast errors grow with step sizes of geometry."""
 
-    Parameters
-    ----------
-    per_row : dict
-        Squared error over squared step size and row, by kind of geometry, summed over pixels, three channels and all
-        scored poses.
-    """
-
+    # Squared error over squared step size and row, by kind of geometry, summed over pixels, three channels and all
+    # scored poses.
     per_row: dict[str, float]
 
     def step(self, kind: str, multiplier: float) -> float:
@@ -63,18 +58,9 @@ def probe_slopes(
 ) -> Slopes:
     """Measure the slopes of the geometry; the scene is drawn five times from at most `most` poses.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    planes : dict
-        Stored planes ([width, n] f32 by field); not changed.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    cameras : sequence of Camera
-        All scored poses. Those to draw from are evenly spread among them.
-    most : int
-        Most poses to draw from.
+    `renderer`: with nothing loaded. `planes`: stored planes ([width, n] f32 by field); not changed. `origin`: [3] f64,
+    as in `SceneSource`. `cameras`: all scored poses. Those to draw from are evenly spread among them. `most`: most
+    poses to draw from.
     """
     count, some = planes["means"].shape[1], min(most, len(cameras))
     views = [cameras[i * len(cameras) // some] for i in range(some)]
@@ -130,18 +116,9 @@ def choose_steps(
 ) -> StepSizes:
     """Step sizes of every kind of value for a multiplier.
 
-    Parameters
-    ----------
-    slopes : Slopes
-        Of the geometry.
-    weight2 : np.ndarray
-        [n] f64, sums of squared weights of the kept Gaussians: an error e of a coefficient in luma costs 3 w2 (Y e)^2.
-    degrees : np.ndarray
-        [n] u8, SH degree kept.
-    sh_degree : int
-        SH degree of the scene.
-    multiplier : float
-        Squared error that a bit is worth.
+    `slopes`: of the geometry. `weight2`: [n] f64, sums of squared weights of the kept Gaussians: an error e of a
+    coefficient in luma costs 3 w2 (Y e)^2. `degrees`: [n] u8, SH degree kept. `sh_degree`: SH degree of the scene.
+    `multiplier`: squared error that a bit is worth.
     """
 
     def colour(rows: np.ndarray) -> float:
@@ -182,14 +159,8 @@ def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray)
     Without this, one Gaussian far away and in no view could ask for position steps as large as the scene itself:
     docs/results/stability.md
 
-    Parameters
-    ----------
-    steps : StepSizes
-        As chosen.
-    planes : dict
-        Stored planes ([width, n] f32 by field).
-    seen : np.ndarray
-        [n] bool, rows that some pose sees. They are always in, because `holdable` makes steps coarser for them.
+    `steps`: as chosen. `planes`: stored planes ([width, n] f32 by field). `seen`: [n] bool, rows that some pose sees.
+    They are always in, because `holdable` makes steps coarser for them.
     """
     if not seen.any():
         return np.ones(len(seen), bool)

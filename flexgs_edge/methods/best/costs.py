@@ -6,7 +6,7 @@ Errors of Gaussians that were removed together show only in the next pass.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,6 +23,7 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import planes_of
+from flexgs_edge.scene.source import Planes
 from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.sums import Maker, ViewSums
 
@@ -32,24 +33,14 @@ MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 
 @dataclass
 class RemovalCosts:
-    """Squared errors summed over pixels, three channels and the scored poses.
+    """Squared errors summed over pixels, three channels and the scored poses."""
 
-    Attributes
-    ----------
-    removal : np.ndarray
-        [N] f64, cost of removing the Gaussian. It is exact if the hits of all other splats stay the same.
-    weight2 : np.ndarray
-        [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees.
-    sh : np.ndarray
-        [D, N] f64, cost of keeping SH only up to degree L = 0 .. D-1, with `sh_mean[L]` added to the colour.
-    sh_mean : np.ndarray
-        [D, 3, N] f32, mean colour over poses (weighted by weight2) of the bands above L.
-    """
-
+    # [N] f64, cost of removing the Gaussian. It is exact if the hits of all other splats stay the same.
     removal: np.ndarray
-    weight2: np.ndarray
+    weight2: np.ndarray  # [N] f64, sum of squared weights (alpha T)^2; 0 for Gaussians that no pose sees
+    # [D, N] f64, cost of keeping SH only up to degree L = 0 .. D-1, with `sh_mean[L]` added to the colour.
     sh: np.ndarray
-    sh_mean: np.ndarray
+    sh_mean: np.ndarray  # [D, 3, N] f32, mean colour over poses (weighted by weight2) of the bands above L
 
     @classmethod
     def of(cls, parts: Sequence[CostParts], storage: Storage = IN_MEMORY) -> RemovalCosts:
@@ -81,17 +72,13 @@ class RemovalCosts:
 class CostParts:
     """Sums over a part of the poses, from which costs are computed; sums over other parts can be added.
 
-    Attributes
-    ----------
-    removal, weight2 : np.ndarray
-        [N] f64, as in `RemovalCosts`.
-    moments : np.ndarray
-        [D, 4, N] f64, sums over the colour of the bands above each degree: three of squared weight times colour, one of
-        squared weight times squared colour.
+    `removal`, `weight2`: [N] f64, as in `RemovalCosts`.
     """
 
     removal: np.ndarray
     weight2: np.ndarray
+    # [D, 4, N] f64, sums over the colour of the bands above each degree: three of squared weight times colour, one of
+    # squared weight times squared colour.
     moments: np.ndarray
 
     def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> CostParts:
@@ -104,19 +91,14 @@ def cost_bytes(sh_degree: int) -> int:
     return 32 * (1 + sh_degree)
 
 
-PART_NAMES = ("removal", "weight2", "moments")
-"""Arrays of `CostParts`."""
+PART_NAMES = ("removal", "weight2", "moments")  # Arrays of `CostParts`
 
 
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:
     """Maker of the sums over views from which costs are computed.
 
-    Parameters
-    ----------
-    degree : int
-        SH degree of the scene, or 0 to leave the costs of dropping SH degrees out.
-    first : int
-        Plane of a view's sums at which the removal sums begin.
+    `degree`: SH degree of the scene, or 0 to leave the costs of dropping SH degrees out. `first`: plane of a view's
+    sums at which the removal sums begin.
     """
     return partial(_ChunkCosts, renderer, degree, first)
 
@@ -139,27 +121,13 @@ def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
 
 
 def measure_costs(
-    bench: Bench,
-    scene: DeviceScene,
-    cameras: Sequence[Camera],
-    sh_costs: bool = True,
-    progress: Progress = SILENT,
+    bench: Bench,  # draws the views
+    scene: DeviceScene,  # loaded with room for the sums of this pass
+    cameras: Sequence[Camera],  # the scored poses
+    sh_costs: bool = True,  # Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
+    progress: Progress = SILENT,  # told of each view
 ) -> RemovalCosts:
-    """Measure costs in one pass, which takes about twice the time of rendering the poses.
-
-    Parameters
-    ----------
-    bench : Bench
-        Draws the views.
-    scene : DeviceScene
-        Loaded with room for the sums of this pass.
-    cameras : sequence of Camera
-        The scored poses.
-    sh_costs : bool
-        Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
-    progress : Progress
-        Told of each view.
-    """
+    """Measure costs in one pass, which takes about twice the time of rendering the poses."""
     degree = scene.sh_degree if sh_costs else 0
     costs = ViewSums(bench, scene, [cost_sums(bench.renderer, degree)])
     try:
@@ -197,3 +165,55 @@ class _ChunkCosts:
         if self._array is not None:
             self._array.release()
             self._array = None
+
+
+class Snapshot:
+    """The Gaussians that are kept after a round, with refitted colours and measured costs.
+
+    `rows`: [n] i64, places in the rows that the rounds began with (`PruneRounds.rows`), ascending. `planes`: stored
+    planes of these rows ([width, n] f32 by field). `costs`: costs of these rows.
+    """
+
+    def __init__(self, rows: np.ndarray, planes: Planes, costs: RemovalCosts) -> None:
+        self.rows, self.costs = rows, costs
+        self._planes: Planes | None = planes
+        self._again: Callable[[], Planes] | None = None
+
+    @property
+    def count(self) -> int:
+        """Gaussians kept."""
+        return len(self.rows)
+
+    @property
+    def planes(self) -> Planes:
+        """Stored planes of the rows. If they were let go, they are made again."""
+        if self._planes is None:
+            assert self._again is not None
+            self._planes = self._again()
+        return self._planes
+
+    @property
+    def held(self) -> bool:
+        """Whether the planes need not be made again."""
+        return self._planes is not None
+
+    def let_go(self, again: Callable[[], Planes]) -> None:
+        """Free the planes; `again` makes them once more if somebody asks for them."""
+        self._planes, self._again = None, again
+
+    def cheapest(self, count: int) -> np.ndarray:
+        """[n] bool: False for the `count` rows that are cheapest to remove. Rows that no pose sees stay; ties go by row."""
+        seen = self.costs.weight2 > 0
+        return ~lowest(np.where(seen, self.costs.removal, np.inf), min(count, int(np.count_nonzero(seen))))
+
+
+def lowest(values: np.ndarray, count: int) -> np.ndarray:
+    """[n] bool: True for the `count` smallest of `values` (all, if there are no more). Of equal values the first ones count."""
+    if count >= len(values):
+        return np.ones(len(values), bool)
+    if count <= 0:
+        return np.zeros(len(values), bool)
+    edge = np.partition(values, count - 1)[count - 1]
+    chosen: np.ndarray = values < edge
+    chosen[np.flatnonzero(values == edge)[: count - int(np.count_nonzero(chosen))]] = True
+    return chosen

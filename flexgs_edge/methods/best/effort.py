@@ -16,8 +16,7 @@ from flexgs_edge.run.options import CompressOptions
 
 LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
-FINE_PASSES = 0.75
-"""Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes"""
+FINE_PASSES = 0.75  # Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes
 MANY_POSES = 125
 """Beyond so many poses, steps of a descent grow with the root of their number: docs/results/tuning.md#many_poses"""
 LEAST_VIEWS = 6
@@ -30,8 +29,7 @@ docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
 """Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
 in every view: docs/results/tuning.md#distances"""
-STEP_UNIT = 1 / 32
-"""Distances are multiples of it, so that no last bit of a sum decides."""
+STEP_UNIT = 1 / 32  # Distances are multiples of it, so that no last bit of a sum decides
 SHIFTS = 0.7548776662466927, 0.5698402909980532
 """Shares of a distance by which the lattice moves right and down from view to view: powers of the root of x^3 = x + 1, whose
 multiples fill the unit square evenly."""
@@ -39,57 +37,33 @@ multiples fill the unit square evenly."""
 
 @dataclass(frozen=True)
 class Effort:
-    """How much work a search spends, as fixed counts.
+    """How much work a search spends, as fixed counts."""
 
-    Parameters
-    ----------
-    keep : float
-        Share of the Gaussians that stays in each round of pruning: docs/results/tuning.md#keep
-    refit_rounds : int
-        Rounds of the refit on all coefficients before SH are put on their grid. One round on the constant follows. `fast`
-        has none, because they cost more time there than their bytes are worth: docs/results/tuning.md#refit_rounds
-    subsets : int
-        Most steps of a round, as for `refit_colours`.
-    close : float
-        A search ends when a candidate's log of the largest share is no farther than this below 0.
-    few : int
-        Least scored poses, if there are as many: docs/results/tuning.md#few
-    views : int
-        Most scored poses. We take more than `few` if these have too few pixels.
-    pixels : int
-        Points of all scored poses that we look at, for each Gaussian. There are more if they would lie farther apart than
-        `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
-        docs/results/tuning.md#pixels
-    refitted : float
-        `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
-        makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
-    probed : int
-        Most poses that trial grids are measured on: docs/results/tuning.md#probed
-    passes : float
-        How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0 (default):
-        colours are refitted instead.
-    interleaved : int
-        Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
-        docs/results/tuning.md#interleaved
-    interleave_at : float
-        Pruning stops for such a descent at this share of the loss that the target allows.
-    descends : int
-        Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
-        docs/results/tuning.md#descends
-    """
-
-    keep: float
+    keep: float  # share of the Gaussians that stays in each round of pruning: docs/results/tuning.md#keep
+    # Rounds of the refit on all coefficients before SH are put on their grid. One round on the constant follows. `fast`
+    # has none, because they cost more time there than their bytes are worth: docs/results/tuning.md#refit_rounds
     refit_rounds: int
-    subsets: int
-    close: float
-    few: int
-    views: int
+    subsets: int  # most steps of a round, as for `refit_colours`
+    close: float  # a search ends when a candidate's log of the largest share is no farther than this below 0
+    few: int  # least scored poses, if there are as many: docs/results/tuning.md#few
+    views: int  # Most scored poses. We take more than `few` if these have too few pixels.
+    # Points of all scored poses that we look at, for each Gaussian. There are more if they would lie farther apart than
+    # `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
+    # docs/results/tuning.md#pixels
     pixels: int
+    # `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
+    # makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
     refitted: float = REFITTED
-    probed: int = 8
+    probed: int = 8  # most poses that trial grids are measured on: docs/results/tuning.md#probed
+    # How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0
+    # (default): colours are refitted instead.
     passes: float = 0.0
+    # Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
+    # docs/results/tuning.md#interleaved
     interleaved: int = 0
-    interleave_at: float = 0.8
+    interleave_at: float = 0.8  # pruning stops for such a descent at this share of the loss that the target allows
+    # Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
+    # docs/results/tuning.md#descends
     descends: int = 0
 
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
@@ -110,16 +84,8 @@ def sampling_steps(
     The distances are the largest that leave about `pixels` points in all. A pose of weight w gets about w times as many
     as one of weight 1, as errors add up over points.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        The poses.
-    pixels : int
-        Points of all poses together.
-    coverage : float
-        Share of the pixels that the scene covers, which alone count. Default: all.
-    weights : np.ndarray, optional
-        [n] f64, above 0 to 1, one of them 1. Default: equal ones.
+    `cameras`: the poses. `pixels`: points of all poses together. `coverage`: share of the pixels that the scene covers,
+    which alone count. Default: all. `weights`: [n] f64, above 0 to 1, one of them 1. Default: equal ones.
     """
     spread = [1.0] * len(cameras) if weights is None else [1.0 / math.sqrt(weight) for weight in weights.tolist()]
     widest = max(spread)
@@ -159,15 +125,7 @@ def pixels_of(cameras: Sequence[Camera], steps: Sequence[float]) -> int:
 
 EFFORTS = {
     "fast": Effort(
-        keep=0.77,
-        refit_rounds=0,
-        subsets=7,
-        close=0.3,
-        few=32,
-        views=96,
-        pixels=12,
-        refitted=0.93,
-        probed=4,
+        keep=0.77, refit_rounds=0, subsets=7, close=0.3, few=32, views=96, pixels=12, refitted=0.93, probed=4
     ),
     "balanced": Effort(
         keep=0.8,
@@ -206,18 +164,8 @@ def effort_of(options: CompressOptions) -> Effort:
 def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False, fine: bool = False) -> int:
     """Steps of the descent to a candidate; 0 for none.
 
-    Parameters
-    ----------
-    options : CompressOptions
-        Effort, `distil` and `refit`.
-    poses : int
-        Scored poses.
-    count : int
-        Gaussians of the scene.
-    foreign : bool
-        The file has another format than `.fgs`, with a grid of its own.
-    fine : bool
-        The poses have every pixel: see `is_fine`.
+    `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `foreign`: the file
+    has another format than `.fgs`, with a grid of its own. `fine`: the poses have every pixel: see `is_fine`.
     """
     if foreign:
         return 0

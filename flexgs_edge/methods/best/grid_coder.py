@@ -10,25 +10,39 @@ import numpy as np
 
 from flexgs_edge.codec.v2.container import coded_size, write_grid
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
+from flexgs_edge.codec.v2.header import PREVIEW_KEY
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.memory.heap import trim_heap
+from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
+from flexgs_edge.run.options import CompressOptions
 
-SETTINGS_MOST = 1536
-"""Most bytes of the settings of any file in its header."""
+LAYERS_COST = 1.06
+"""Most bytes of a layered file over those of a file without layers: neighbours on the curve are farther apart in it.
+docs/results/tuning.md#layers_cost"""
+SETTINGS_MOST = 1536  # Most bytes of the settings of any file in its header
+
+
+def projected_size(options: CompressOptions, size: int) -> int:
+    """Bytes that a file of `size` bytes will have with the layers and the preview that were asked for.
+
+    A preview by default comes only where it fits.
+    """
+    cost = 1.0 if options.layers in (None, 1) else LAYERS_COST
+    return round(cost * size) + with_preview(options.preview or 0)
+
+
+def with_preview(size: int) -> int:
+    """Most bytes by which a preview of `size` bytes makes a file longer; 0 if there is none."""
+    return size + PREVIEW_KEY if size else 0
 
 
 class GridCoder:
     """Codes grids. The last one stays coded, so that writing it only copies bytes.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        Its device codes if it can.
-    settings_room : int
-        Most bytes of the settings in the header. The search counts them before they are known.
+    `renderer`: its device codes if it can. `settings_room`: most bytes of the settings in the header. The search counts
+    them before they are known.
     """
 
     def __init__(self, renderer: Renderer, settings_room: int = SETTINGS_MOST) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,30 +13,96 @@ from flexgs_edge.goals.promise import excesses
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.on_grid import lowered
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.to_grid import recolour, to_grid
+from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.grid.values import values_of
-from flexgs_edge.methods.best import descents
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
-from flexgs_edge.methods.best.costs import RemovalCosts, cost_bytes, measure_costs
+from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
-from flexgs_edge.methods.best.guess import PRUNED_PART, Guess, Measure
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, Schedule, distil, structure_of
+from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil, share_of_lead, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
-from flexgs_edge.methods.best.selection import Kept, Selection
-from flexgs_edge.methods.best.snapshot import Snapshot
+from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
+DISTILLED, DISTILLED_POWER = 0.46, -0.2
+"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
+the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
+"""Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
+left and of the probe: docs/results/tuning.md#distilled"""
+BEHIND_LED = -0.09
+"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
+FULL_PASSES = 10
+"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
+goes the course `SHORT`: docs/results/tuning.md#full_passes"""
+FULL_RATES, LEAST_RATE = 41.0, 0.25
+"""Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
+PRUNED_DISTILLED = 1.6
+"""`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
+INTERLEAVE_TO, MOST_LEFT = 0.8, 0.9
+"""The first candidate comes once two descents in a row leave more than the first share of the loss that the target allows. One
+that leaves more than the second does not count: docs/results/tuning.md#interleaved"""
+MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
+"""With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
+many; and most descents: docs/results/tuning.md#interleaved"""
+INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
+"""Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
+docs/results/tuning.md#interleaved"""
+
+
+def fits(most: int) -> list[float]:
+    """At how many times the Gaussians that a size allows pruning stops for each of at most so many descents."""
+    count = min(most, FIT_DESCENTS)
+    return [MOST_FIT * (LEAST_FIT / MOST_FIT) ** (k / max(count - 1, 1)) for k in range(count)]
+
+
+def rate_from(fidelity: float | None) -> float:
+    """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
+
+    With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
+    """
+    return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
+
+
+@dataclass(frozen=True)
+class Descents:
+    """The descents of a search."""
+
+    steps: int  # of the descent to a candidate; 0 for none
+    poses: int  # scored poses
+    lead: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
+
+    @property
+    def passes(self) -> float:
+        """Steps of the descent to a candidate for each scored pose."""
+        return self.steps / self.poses
+
+    def schedule(self, share: float, fidelity: float | None, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+        """A descent with `share` of a candidate's steps, from planes of this fidelity."""
+        rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
+        course = LONG if self._long else SHORT
+        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=course)
+
+    def after(self, excess: float, left: float | None = None) -> float:
+        """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
+        if left is None:
+            return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
+        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
+        return (left + excess) / 2 + behind
+
+    @property
+    def _long(self) -> bool:
+        return self.passes >= FULL_PASSES
+
+
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
-FAR = 0.1
-"""Log of the share from which on we ask whether the descent mended anything."""
+FAR = 0.1  # Log of the share from which on we ask whether the descent mended anything
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""
@@ -45,37 +111,17 @@ results that are too large can be trimmed: docs/results/tuning.md#landing"""
 class GridMaker:
     """Makes grids that are coded in container version 2; a `Maker`.
 
-    Parameters
-    ----------
-    rounds : PruneRounds
-        Rounds of pruning; more are done when they are needed.
-    size_of : callable
-        Bytes of a grid's file.
-    measure : callable
-        Quality of planes.
-    effort : Effort
-        How much work to spend.
-    refit : bool
-        Refit the colours of each candidate (default).
-    steps : int
-        Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
-    see : callable, optional
-        Scores poses beside these of the views that decide, as `Maker.see`.
-
-    Attributes
-    ----------
-    selection : Selection
-        Which Gaussians stay.
+    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay.
     """
 
     def __init__(
         self,
-        rounds: PruneRounds,
-        size_of: Callable[[GridScene], int],
-        measure: Measure,
-        effort: Effort,
-        refit: bool = True,
-        steps: int = 0,
+        rounds: PruneRounds,  # rounds of pruning; more are done when they are needed
+        size_of: Callable[[GridScene], int],  # bytes of a grid's file
+        measure: Measure,  # quality of planes
+        effort: Effort,  # how much work to spend
+        refit: bool = True,  # refit the colours of each candidate (default)
+        steps: int = 0,  # Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
         see: Callable[[Sequence[int], int], bool] | None = None,
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure
@@ -93,7 +139,7 @@ class GridMaker:
     def start(self, target: Target) -> float:
         """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
         self._interleave(target)
-        self._guess.prune(self.selection, target, descents.PRUNED_DISTILLED if self.steps else PRUNED_PART)
+        self._guess.prune(self.selection, target, PRUNED_DISTILLED if self.steps else PRUNED_PART)
         multiplier = self.selection.cut()
         if target.limit_bytes is None:
             self._guess.learn(values_of(self._before_refit(multiplier), self.rounds.storage), target)
@@ -163,7 +209,7 @@ class GridMaker:
     def _interleave(self, target: Target) -> None:
         """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
         by_size, after = target.limit_bytes is not None, -math.inf
-        for fit in descents.fits(self._interleaved) if by_size else [1.0] * self._interleaved:
+        for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
             self._guess.prune(self.selection, target, self.effort.interleave_at, fit)
             self.rounds.renew(self._cut_and_descend)
             before = after
@@ -171,18 +217,18 @@ class GridMaker:
                 planes = self.selection.last.planes
                 self._guess.learn(planes, target)
                 after = self._guess(planes, target)
-                if after >= math.log(descents.MOST_LEFT):
+                if after >= math.log(MOST_LEFT):
                     break
                 self._left = after
             self.selection.begin = len(self.rounds.snapshots) - 1
             # One alone may leave more by chance.
-            if min(before, after) >= math.log(descents.INTERLEAVE_TO):
+            if min(before, after) >= math.log(INTERLEAVE_TO):
                 break
 
     def _cut_and_descend(self) -> tuple[np.ndarray, Planes]:
         """Rows and planes after a cut by half a round and a descent off the grid."""
         kept = self.selection.kept(self.selection.cut())
-        schedule = self._schedule(descents.INTERLEAVED_SHARE, kept.planes, last=descents.INTERLEAVED_LAST)
+        schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=INTERLEAVED_LAST)
         return kept.rows, self._distil(kept, schedule)
 
     def _after(self, excess: float) -> float:
@@ -291,8 +337,8 @@ class GridMaker:
         return self._descents.schedule(share, fidelity, last, multiplier)
 
     @property
-    def _descents(self) -> descents.Descents:
-        return descents.Descents(self.steps, len(self.rounds.original.cameras), self._guess.lead)
+    def _descents(self) -> Descents:
+        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.lead)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         weight = structure_of(self._guess.lead)

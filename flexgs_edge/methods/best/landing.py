@@ -11,17 +11,13 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.curve import morton
 
-REACH = 0.04
-"""Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better."""
-NEAR = 0.002
-"""How far below the limit, as a share of it, we are content."""
-TRIES = 4
-"""Most times that the file is coded on the way."""
+REACH = 0.04  # Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better.
+NEAR = 0.002  # How far below the limit, as a share of it, we are content
+TRIES = 4  # Most times that the file is coded on the way
 SHARE, DESCENDED_SHARE = 0.5, 0.33
 """Share of the Gaussians to remove at first, for each unit of the log of what a quality allows; and behind a descent, where each
 matters more: docs/results/tuning.md#landing"""
-NEAR_QUALITY = 0.02
-"""How far below what it allows, as a share of it, we are content."""
+NEAR_QUALITY = 0.02  # How far below what it allows, as a share of it, we are content
 QUALITY_TRIES, DESCENDED_TRIES = 1, 6
 """Most results that are made and measured on the way to a quality, and behind a descent; one more if none of them holds:
 docs/results/tuning.md#landing"""
@@ -32,25 +28,9 @@ def land(
 ) -> tuple[GridScene, int]:
     """Remove the Gaussians whose removal costs least, until the file just fits.
 
-    Parameters
-    ----------
-    grid : GridScene
-        The result.
-    removal : np.ndarray
-        [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
-    size : int
-        Its bytes.
-    limit : int
-        Most bytes.
-    size_of : callable
-        Bytes of a grid's file.
-    storage : Storage
-        Holds the new grid.
-
-    Returns
-    -------
-    tuple
-        The grid and its bytes; those that were given if it fits already, is too large for this, or cannot be made to fit.
+    `grid`: the result. `removal`: [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
+    `size`: its bytes. `limit`: most bytes. `size_of`: bytes of a grid's file. `storage`: holds the new grid. Returns
+    the grid and its bytes; those that were given if it fits already, is too large for this, or cannot be made to fit.
     """
     if not 0.0 < math.log(size / limit) <= REACH:
         return grid, size
@@ -77,32 +57,17 @@ def land(
 
 
 def land_on_quality(
-    grid: GridScene,
-    removal: np.ndarray,
-    excesses: Sequence[float],
+    grid: GridScene,  # the result, which holds
+    removal: np.ndarray,  # [n] f64, cost of the removal of each of its rows, infinite for those that must stay
+    excesses: Sequence[float],  # log of its loss over what is allowed, for each bound of the promise; all below 0
     attempt: Callable[[GridScene], Sequence[float]],
-    storage: Storage,
-    most: int,
-    descended: bool = False,
+    storage: Storage,  # holds the grids
+    most: int,  # most results, whatever is usual
+    descended: bool = False,  # the result comes from a descent
 ) -> None:
     """Remove the Gaussians whose removal costs least, until a quality hardly holds.
 
-    Parameters
-    ----------
-    grid : GridScene
-        The result, which holds.
-    removal : np.ndarray
-        [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
-    excesses : sequence of float
-        Log of its loss over what is allowed, for each bound of the promise; all below 0.
-    attempt : callable
-        Makes and measures the result of a grid, and returns its excesses.
-    storage : Storage
-        Holds the grids.
-    most : int
-        Most results, whatever is usual.
-    descended : bool
-        The result comes from a descent.
+    `attempt`: makes and measures the result of a grid, and returns its excesses.
     """
     cheapest = np.argsort(removal, kind="stable")
     least, beyond, aim = 0, _beyond(removal), -NEAR_QUALITY / 2

@@ -27,8 +27,7 @@ from flexgs_edge.views.bench import Bench
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
 layers and the header."""
-MOST_SORTED = 1 << 18
-"""So many rows may always be sorted. Of more, see `can_sort`."""
+MOST_SORTED = 1 << 18  # So many rows may always be sorted. Of more, see `can_sort`.
 SORTED_ROW_BYTES = 41
 """Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
 ROUND, LARGE_ROUND = 0.8, 0.5
@@ -45,12 +44,12 @@ def can_sort(rows: int, original: int) -> bool:
 
 
 def assign_layers(
-    grid: GridScene,
+    grid: GridScene,  # the scene to sort
     parts: Sequence[float],
-    bits: BitModel,
-    bench: Bench,
-    cameras: Sequence[Camera],
-    progress: Progress = SILENT,
+    bits: BitModel,  # bits that the coder takes for a row of each SH degree
+    bench: Bench,  # draws the views
+    cameras: Sequence[Camera],  # the scored poses
+    progress: Progress = SILENT,  # told of each view
 ) -> GridScene:
     """Sort the Gaussians into layers by cost of removal for each bit.
 
@@ -58,26 +57,8 @@ def assign_layers(
     no refit. What is left is measured as large as viewers draw it (`growth`).
     Gaussians that no pose sees come last.
 
-    Parameters
-    ----------
-    grid : GridScene
-        The scene to sort.
-    parts : sequence of float
-        Share of the bits that stays when the last layer is cut off, then the last but one, and so on. One layer more than
-        shares is made.
-    bits : BitModel
-        Bits that the coder takes for a row of each SH degree.
-    bench : Bench
-        Draws the views.
-    cameras : sequence of Camera
-        The scored poses.
-    progress : Progress
-        Told of each view.
-
-    Returns
-    -------
-    GridScene
-        The same Gaussians in the order of their layers.
+    `parts`: share of the bits that stays when the last layer is cut off, then the last but one, and so on. One layer
+    more than shares is made. Returns the same Gaussians in the order of their layers.
     """
     storage = bench.renderer.storage
     planes, left, layer = values_of(grid, storage), np.arange(grid.count), np.zeros(grid.count, np.uint8)
@@ -90,37 +71,21 @@ def assign_layers(
 
 
 def worthiest(
-    planes: dict[str, np.ndarray],
-    degrees: np.ndarray,
-    left: np.ndarray,
-    part: float,
-    bits: BitModel,
+    planes: dict[str, np.ndarray],  # stored planes ([width, n] f32 by field)
+    degrees: np.ndarray,  # [n] u8, SH degrees
+    left: np.ndarray,  # [k] i64, rows to choose from
+    part: float,  # above 0, at most 1
+    bits: BitModel,  # bits of a row of each SH degree
     bench: Bench,
     cameras: Sequence[Camera],
-    origin: np.ndarray,
+    origin: np.ndarray,  # [3] f64, as in `SceneSource`
     progress: Progress = SILENT,
     keep: float | None = None,
 ) -> np.ndarray:
     """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes ([width, n] f32 by field).
-    degrees : np.ndarray
-        [n] u8, SH degrees.
-    left : np.ndarray
-        [k] i64, rows to choose from.
-    part : float
-        Above 0, at most 1.
-    bits : BitModel
-        Bits of a row of each SH degree.
-    bench, cameras, progress
-        As for `assign_layers`.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    keep : float, optional
-        Share of the bits that stays before costs are measured again. Default: by the number of rows.
+    `bench`, `cameras`, `progress`: as for `assign_layers`. `keep`: share of the bits that stays before costs are
+    measured again. Default: by the number of rows.
     """
     renderer, storage = bench.renderer, bench.renderer.storage
     cost = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])

@@ -21,24 +21,22 @@ from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.errors import TargetError
 from flexgs_edge.files import temporary_name
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import Scored, SearchResult, Step, step_words
+from flexgs_edge.goals.steps import Choice, Scored, SearchResult, Step, step_words
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import distil_steps, effort_of
-from flexgs_edge.methods.best.grid_coder import GridCoder
+from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
-from flexgs_edge.methods.best.guess import Measure
-from flexgs_edge.methods.best.keep import kept_as_it_is, reckoned, with_preview
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
-from flexgs_edge.methods.best.poses import ScoredPoses, is_fine, scored_poses
+from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, is_fine, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
+from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
-from flexgs_edge.methods.best.view_weights import KnownErrors
+from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.decoding import decoded
@@ -61,23 +59,14 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
-def compress(run: Run[CompressOptions], bench: Bench) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a `.fgs` of version 2.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with views and a target.
-    bench : Bench
-        Draws the views. Its renderer gets the storage that the search needs.
-
-    Raises
-    ------
-    TargetError
-        When nothing holds and `best_effort` is not set.
-    BudgetError
-        When the scene does not fit.
+    `run`: planned, with views and a target. `bench`: draws the views. Its renderer gets the storage that the search
+    needs. Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene
+    does not fit.
     """
+    assert bench is not None  # the plan has refused runs without views
     output = run.output.path
     with Judges(run, bench) as judges:
         poses = choose_poses(run, bench, judges.decide)
@@ -90,11 +79,8 @@ def compress(run: Run[CompressOptions], bench: Bench) -> Made:
                 kept = open_checkpoint(run, bench.renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
         coder = GridCoder(bench.renderer, settings_room(run))
-        with run.clock.stage("search"):
-            found = kept_as_it_is(run, bench, coder, judges.decide)
-        grid, search = found or search_best(
-            grid_maker(run.options, coder), run, bench, poses, judges.decide, checkpoint=kept
-        )
+        maker = grid_maker(run.options, coder)
+        grid, search = search_best(maker, run, bench, poses, judges.decide, checkpoint=kept)
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
             with run.clock.stage("layers"):
@@ -174,16 +160,16 @@ def _tried(
     return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
-def grid_maker(options: CompressOptions, coder: GridCoder, kind: type[GridMaker] = GridMaker) -> MakerOf[GridScene]:
+def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]:
     """Make makers of the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
-        return reckoned(options, coder.size(grid))
+        return projected_size(options, coder.size(grid))
 
     plan = effort_of(options)
 
     def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:
-        maker = kind(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
+        maker = GridMaker(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
         maker.selection.most = options.max_gaussians
         return maker
 
@@ -193,14 +179,7 @@ def grid_maker(options: CompressOptions, coder: GridCoder, kind: type[GridMaker]
 def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> ScoredPoses:
     """`scored_poses` for a run.
 
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench
-        Its renderer has nothing loaded.
-    judge : Judge
-        On the views that decide.
+    `run`: planned. `bench`: its renderer has nothing loaded. `judge`: on the views that decide.
     """
     return scored_poses(
         run.seen.of(run.seen.train),
@@ -214,36 +193,17 @@ def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> Score
 
 
 def search_best(
-    make: MakerOf[Product],
-    run: Run[CompressOptions],
-    bench: Bench,
-    poses: ScoredPoses,
-    judge: Judge,
-    checkpoint: Checkpoint | None = None,
+    make: MakerOf[Product],  # `grid_maker`, or what makes a file of another format
+    run: Run[CompressOptions],  # Planned. The storage of `bench.renderer` holds its scene as a whole.
+    bench: Bench,  # draws the views
+    poses: ScoredPoses,  # from `scored_poses`
+    judge: Judge,  # prepared on the views that decide
+    checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run (`--resume`)
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
 
-    Parameters
-    ----------
-    make : callable
-        `grid_maker`, or what makes a file of another format.
-    run : Run
-        Planned. The storage of `bench.renderer` holds its scene as a whole.
-    bench : Bench
-        Draws the views.
-    poses : ScoredPoses
-        From `scored_poses`.
-    judge : Judge
-        Prepared on the views that decide.
-    checkpoint : Checkpoint, optional
-        Keeps the rounds for a later run (`--resume`).
-
-    Raises
-    ------
-    TargetError
-        When nothing holds and `best_effort` is not set.
-    BudgetError
-        When the scene does not fit.
+    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
+    fit.
     """
     with (
         open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
@@ -274,30 +234,13 @@ def search_best(
 
 @contextmanager
 def open_rounds(
-    run: Run[CompressOptions],
-    bench: Bench,
-    scored: Sequence[Camera],
-    make: Callable[..., PruneRounds] = PruneRounds,
-    checkpoint: Checkpoint | None = None,
-    known: KnownErrors | None = None,
+    run: Run[CompressOptions],  # planned
+    bench: Bench,  # draws the views
+    scored: Sequence[Camera],  # from `scored_poses`
+    checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run
+    known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
 ) -> Iterator[PruneRounds]:
-    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first.
-
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench
-        Draws the views.
-    scored : sequence of Camera
-        From `scored_poses`.
-    make : callable, optional
-        Builds the rounds from the arguments of `PruneRounds`.
-    checkpoint : Checkpoint, optional
-        Keeps the rounds for a later run.
-    known : KnownErrors, optional
-        From `scored_poses`; descents look at poses by it.
-    """
+    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first."""
     renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
     foreign, fine = run.output.format is not None, is_fine(options, source)
     storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, foreign, fine)
@@ -314,12 +257,12 @@ def open_rounds(
                 between = poses_between(scored) if steps else ()
                 poses = [*scored, *between]
                 turns = known.slopes(poses) if known and steps else None
-                rounds = make(
+                rounds = PruneRounds(
                     Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
                     source,
                     refit=options.refit,
                     unseen_share=options.unseen_share,
-                    **({} if checkpoint is None else {"checkpoint": checkpoint}),
+                    checkpoint=checkpoint,
                 )
             yield rounds
     finally:

@@ -8,17 +8,226 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.order import covering_order
+from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance, between
+from flexgs_edge.cameras.nearness import nearest, squared_distances
+from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
-from flexgs_edge.methods.best.margin import margin_of
-from flexgs_edge.methods.best.needed_poses import needed_poses, poses_beside
-from flexgs_edge.methods.best.view_weights import KnownErrors, base_errors, rareness, view_weights
+from flexgs_edge.quality.psnr import contrast, far_bases, mse, mse_of_psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.lower_sh import without_degrees
-from flexgs_edge.scene.sample import some_positions
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scene.source import SceneSource, some_positions
+from flexgs_edge.views.depths import visible_depths
+
+LEAST = 1e-6  # Least weight of a pose
+STEP = 4  # Every fourth pixel in both directions is compared
+POWER, RARE_POWER = 4.8, 2.4
+"""Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
+the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
+
+
+@dataclass(frozen=True)
+class KnownErrors:
+    """How near the original is to the photos of the views that decide."""
+
+    cameras: Sequence[Camera]  # the m views
+    errors: np.ndarray  # [m] f64, from `base_errors`
+    drop: float  # allowed drop, dB
+
+    def slopes(self, cameras: Sequence[Camera]) -> np.ndarray:
+        """[n] f64, above 0 to 1: the slope of the drop by the error, of the view that is nearest to each camera.
+
+        `cameras`: the n poses.
+        """
+        allowed = float(np.median(self.errors)) * (10 ** (self.drop / 10) - 1)
+        slopes = 1.0 / (self.errors + max(allowed, 1e-12))
+        nearest = squared_distances(cameras, self.cameras).argmin(axis=1)
+        relative: np.ndarray = (slopes / slopes.max())[nearest]
+        return relative
+
+
+def base_errors(
+    renderer: Renderer,  # with nothing loaded
+    source: SceneSource,  # the original
+    cameras: Sequence[Camera],  # the views that decide
+    photo: Callable[[int, np.ndarray], np.ndarray],
+    base_psnr: float = DEFAULT_BASE_PSNR,  # as for `far_bases`
+) -> np.ndarray:
+    """[n] f64, mean squared error of the original against the photo of each view, or that of `far_bases`.
+
+    `photo`: the photo of a view, [H, W, 3] f32 in [0, 1], by its place in `cameras` and a render of this size.
+    """
+    errors, contrasts = [], []
+    with renderer.load(source) as scene:
+        coarse = [camera.every(STEP) for camera in cameras]
+        for place, camera in enumerate(renderer.in_turn(scene, coarse)):
+            image = np.clip(renderer.render(scene, camera), 0.0, 1.0)
+            seen = photo(place, image)
+            errors.append(mse(image, seen))
+            contrasts.append(contrast(seen))
+    renderer.release()
+    bases = far_bases(errors, contrasts, base_psnr)
+    return np.array([error if base is None else mse_of_psnr(base) for error, base in zip(errors, bases, strict=True)])
+
+
+def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
+    """How much an error counts in each scored pose, relative to the largest weight.
+
+    `slopes`: [n] f64, from `KnownErrors.slopes`. `rare`: [n] f64, from `rareness`. Returns [n] f64, above 0 to 1.
+    """
+    weights: np.ndarray = slopes**POWER * rare**RARE_POWER
+    relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
+    return relative
+
+
+def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.ndarray:
+    """[n] f64, above 0 to 1: mean over the points in each picture of 1 / number of poses that have them in theirs.
+
+    `cameras`: the scored poses. `points`: [3, k] f64, a sample of the scene's positions, world coordinates. `near`:
+    near plane, scene units.
+    """
+    seen = np.array([in_picture(camera, points, near) for camera in cameras])
+    share = seen / np.maximum(seen.sum(axis=0), 1)
+    found: np.ndarray = share.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    # A pose that shows none of the points counts as the least of the others.
+    shown = found > 0
+    return np.where(shown, found, found[shown].min()) if shown.any() else np.ones(len(cameras))
+
+
+EVERY, BETWEEN = 8, 7
+"""Of `EVERY` given poses, the first and fifth get a nearer one, the third and seventh a farther one, and number `BETWEEN` one
+half way to its nearest neighbour: docs/results/tuning.md#margin. They come on top of the given poses; in place of them they
+would make files larger."""
+TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
+
+
+def margin_of(
+    renderer: Renderer, source: SceneSource, poses: Sequence[Camera], cameras: Sequence[Camera]
+) -> list[Camera]:
+    """Five made poses for every eight.
+
+    `renderer`: with nothing loaded. `source`: the original. `poses`: poses that are scored, the most important first.
+    `cameras`: all training poses.
+    """
+    moved = [place for place in range(len(poses)) if place % EVERY in TIMES]
+    depths = dict(zip(moved, visible_depths(renderer, source, [poses[place] for place in moved]), strict=True))
+    made = []
+    for place, camera in enumerate(poses):
+        if place in depths:
+            made.append(at_distance(camera, depths[place], TIMES[place % EVERY]))
+        elif place % EVERY == BETWEEN and len(cameras) > 1:
+            others = [other for other in cameras if other is not camera]
+            away = [float(np.square(other.center - camera.center).sum()) for other in others]
+            made.append(between(camera, others[int(np.argmin(away))]))
+    return made
+
+
+LEAST_GAIN = 0.2
+"""A pose is needed if it adds at least this share of its own picture to what the scored ones see:
+docs/results/tuning.md#needed"""
+GAIN_DIGITS = 4  # Decimals in comparisons of what a pose adds
+NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half way between them, if that is needed
+BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
+MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
+POINTS = 512  # Most points that tell what poses see
+
+
+def needed_poses(
+    scored: Sequence[Camera],  # poses that are scored already, given and made ones
+    given: Sequence[Camera],  # the given ones among them
+    rest: Sequence[Camera],  # Given poses that are not scored. They may be needed as they are.
+    deciding: Sequence[Camera],
+    points: np.ndarray,  # [3, n] f64, a sample of the scene's positions, world coordinates
+    near: float,  # near plane, scene units
+) -> list[Camera]:
+    """The poses that add enough to what the scored ones see, each next one the one that adds most.
+
+    A point adds 1 / (1 + k) to a pose that has it in its picture. Each other pose that shows the point adds to k, as in
+    `covering_order`, and less if it shows the point smaller: by the square of the ratio of its sizes in both pictures.
+    What a pose adds is the mean over the points in its picture. Occlusion is ignored.
+
+    `deciding`: the views that decide. They are not scored, but poses half way to them are, if they are needed.
+    """
+    points = points[:, :: -(-points.shape[1] // POINTS)] if points.shape[1] else points
+    there = [_seen(camera, points, near) for camera in scored]
+    found = [(camera, _seen(camera, points, near)) for camera in rest]
+    for camera, other in _pairs(given, deciding, there, points, near):
+        middle = between(camera, other)
+        found.append((middle, _seen(middle, points, near)))
+    known = [_known(seen, there) for _, seen in found]
+    needed: list[Camera] = []
+    while found and len(needed) < MOST_TIMES * len(given):
+        gains = [_gain(seen, already) for (_, seen), already in zip(found, known, strict=True)]
+        best = int(np.argmax(gains))
+        if gains[best] < LEAST_GAIN:
+            break
+        camera, added = found.pop(best)
+        known.pop(best)
+        needed.append(camera)
+        for (_, seen), already in zip(found, known, strict=True):
+            already += _known(seen, [added])
+    return needed
+
+
+def poses_beside(view: Camera, given: Sequence[Camera]) -> list[Camera]:
+    """Poses half way between a view and the given poses nearest to it.
+
+    `view`: a view that lost too much. `given`: the given poses that are scored.
+    """
+    return [between(given[place], view) for place in nearest(view, given, BESIDE)]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Which points a pose shows ([n] bool), their directions ([3, n] f64), and their distances in focal lengths ([n] f64)."""
+
+    shown: np.ndarray
+    ahead: np.ndarray
+    away: np.ndarray
+
+
+def _seen(camera: Camera, points: np.ndarray, near: float) -> _Seen:
+    ahead = points - camera.center[:, None]
+    away = np.maximum(np.sqrt(np.square(ahead).sum(axis=0)), np.finfo(np.float64).tiny)
+    return _Seen(in_picture(camera, points, near), ahead / away, away / camera.fx)
+
+
+def _known(seen: _Seen, others: Sequence[_Seen]) -> np.ndarray:
+    """[n] f64, how often other poses show each point from about the same direction."""
+    known = np.zeros(len(seen.shown))
+    for other in others:
+        alike = np.maximum(1.0 - (1.0 - (seen.ahead * other.ahead).sum(axis=0)) / SAME_VIEW, 0.0)
+        known += other.shown * alike * np.square(np.minimum(seen.away / other.away, 1.0))
+    return known
+
+
+def _gain(seen: _Seen, known: np.ndarray) -> float:
+    gain = np.where(seen.shown, 1.0 / (1.0 + known), 0.0).sum() / max(np.count_nonzero(seen.shown), 1)
+    return round(float(gain), GAIN_DIGITS)
+
+
+def _pairs(
+    given: Sequence[Camera], deciding: Sequence[Camera], there: Sequence[_Seen], points: np.ndarray, near: float
+) -> list[tuple[Camera, Camera]]:
+    """Neighbours of which one at least would add enough itself: all others have enough poses round them."""
+    pairs: dict[tuple[int, int], None] = {}
+    for place, camera in enumerate(given):
+        own = there[place]
+        if _gain(own, _known(own, [*there[:place], *there[place + 1 :]])) >= LEAST_GAIN:
+            for other in nearest(camera, given, NEIGHBOURS):
+                pairs[min(place, other), max(place, other)] = None
+    found = [(given[first], given[second]) for first, second in pairs]
+    scored = {id(camera) for camera in given}
+    for view in deciding:
+        if id(view) in scored:
+            continue
+        own = _seen(view, points, near)
+        if _gain(own, _known(own, there)) >= LEAST_GAIN:
+            found += [(given[place], view) for place in nearest(view, given, BESIDE)]
+    return found
+
 
 FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
 """Targets stricter than these (dB, dB, compression ratio) keep most SH of most Gaussians. Colours then have as many values
@@ -32,39 +241,18 @@ BESIDE_FINER = 2.0
 
 @dataclass(frozen=True)
 class ScoredPoses:
-    """The scored poses, the most important first.
+    """The scored poses, the most important first."""
 
-    Parameters
-    ----------
-    cameras : list of Camera
-        At every pixel, or at as many as the scene's Gaussians need.
-    made : int
-        How many of them were generated (`--views-margin`).
-    known : KnownErrors, optional
-        What decides how often descents look at a pose. Default: all alike.
-    given : tuple of Camera
-        The given ones among them, at every pixel.
-    step : float
-        Mean distance in pixels between the points that we look at.
-    """
-
-    cameras: list[Camera]
-    made: int = 0
-    known: KnownErrors | None = None
-    given: tuple[Camera, ...] = ()
-    step: float = 1.0
+    cameras: list[Camera]  # at every pixel, or at as many as the scene's Gaussians need
+    made: int = 0  # how many of them were generated (`--views-margin`)
+    known: KnownErrors | None = None  # What decides how often descents look at a pose. Default: all alike.
+    given: tuple[Camera, ...] = ()  # the given ones among them, at every pixel
+    step: float = 1.0  # mean distance in pixels between the points that we look at
 
     def beside(self, views: Sequence[Camera], renderer: Renderer, source: SceneSource) -> list[Camera]:
         """Further poses beside views that lost too much, and nearer and farther ones of these.
 
-        Parameters
-        ----------
-        views : sequence of Camera
-            The views.
-        renderer : Renderer
-            With nothing loaded.
-        source : SceneSource
-            The original.
+        `views`: the views. `renderer`: with nothing loaded. `source`: the original.
         """
         poses = [pose for view in views for pose in poses_beside(view, self.given)]
         poses += margin_of(renderer, source, poses, self.given)
@@ -72,12 +260,12 @@ class ScoredPoses:
 
 
 def scored_poses(
-    cameras: Sequence[Camera],
-    options: CompressOptions,
-    renderer: Renderer,
-    source: SceneSource,
+    cameras: Sequence[Camera],  # all training poses
+    options: CompressOptions,  # effort, target and `makes_poses`
+    renderer: Renderer,  # with nothing loaded
+    source: SceneSource,  # the original
     covered_decides: bool = False,
-    deciding: Sequence[Camera] = (),
+    deciding: Sequence[Camera] = (),  # the views that decide
     photo: Callable[[int, np.ndarray], np.ndarray] | None = None,
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
@@ -86,23 +274,9 @@ def scored_poses(
 
     With `makes_poses`, generated poses come on top: see `margin_of` and `needed_poses`.
 
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        All training poses.
-    options : CompressOptions
-        Effort, target and `makes_poses`.
-    renderer : Renderer
-        With nothing loaded.
-    source : SceneSource
-        The original.
-    covered_decides : bool
-        As for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all pixels count.
-    deciding : sequence of Camera
-        The views that decide.
-    photo : callable, optional
-        The photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses then get pixels by
-        `view_weights`. Default: alike.
+    `covered_decides`: as for `Quality`: only pixels that the scene covers count as pixels to look at. Default: all
+    pixels count. `photo`: the photo of one of these ([H, W, 3] f32) by its place and a render, if photos decide. Poses
+    then get pixels by `view_weights`. Default: alike.
     """
     plan = EFFORTS[options.effort]
     positions = some_positions(source)

@@ -37,50 +37,28 @@ from flexgs_edge.views.references import References
 LEAST_PREVIEWED, PREVIEW_SHARE = 1_000_000, 0.02
 """Where nothing is said, files from so many bytes on get a preview, of this share of their bytes. A smaller file comes within a
 second over 10 Mbit/s: docs/results/tuning.md#preview"""
-DRAWING = "near", "background", "extent", "antialiased"
-"""Settings that say how a file is drawn."""
+DRAWING = "near", "background", "extent", "antialiased"  # Settings that say how a file is drawn
 STAGES = 8, 4, 2
 """How many times as many Gaussians each stage leaves as the last one, which comes behind: docs/results/tuning.md#preview"""
 STEPS, LAST_STEPS, RATE = 150, 400, 2.0
 """Steps of a descent, and of the last one; factor on the rates, since there is a long way to go."""
-KEPT = 0.5
-"""Share of the bits that stays in a stage before costs are measured again: docs/results/tuning.md#preview"""
-COARSE = 2.0
-"""Step sizes of the preview's grid, as multiples of those of the whole scene's."""
-POSES, POINTS = 128, 1 << 14
-"""Most poses, and about the most points that are looked at in each of them."""
+KEPT = 0.5  # Share of the bits that stays in a stage before costs are measured again: docs/results/tuning.md#preview
+COARSE = 2.0  # Step sizes of the preview's grid, as multiples of those of the whole scene's
+POSES, POINTS = 128, 1 << 14  # Most poses, and about the most points that are looked at in each of them
 TRIES, LESS = 3, 0.97
 """How often the last stage is made, each time with fewer Gaussians, until the size holds; and a margin for that."""
 
 
 def make_preview(
-    grid: GridScene,
-    most: int,
-    bits: BitModel,
-    bench: Bench,
-    cameras: Sequence[Camera],
-    settings: Mapping[str, Any],
-    progress: Progress = SILENT,
+    grid: GridScene,  # the whole scene
+    most: int,  # bytes of the preview
+    bits: BitModel,  # bits of the scene's Gaussians
+    bench: Bench,  # Draws the views. Its renderer has nothing loaded.
+    cameras: Sequence[Camera],  # the scored poses; a part of them decides
+    settings: Mapping[str, Any],  # those of the scene's file; the preview is drawn like it
+    progress: Progress = SILENT,  # told of each view
 ) -> bytes:
-    """A file of at most `most` bytes, without SH; no bytes if there is no room for one.
-
-    Parameters
-    ----------
-    grid : GridScene
-        The whole scene.
-    most : int
-        Bytes of the preview.
-    bits : BitModel
-        Bits of the scene's Gaussians.
-    bench : Bench
-        Draws the views. Its renderer has nothing loaded.
-    cameras : sequence of Camera
-        The scored poses; a part of them decides.
-    settings : mapping
-        Those of the scene's file; the preview is drawn like it.
-    progress : Progress
-        Told of each view.
-    """
+    """A file of at most `most` bytes, without SH; no bytes if there is no room for one."""
     if grid.count == 0:
         return b""
     storage = bench.renderer.storage
@@ -108,16 +86,8 @@ def make_preview(
 class _Coded:
     """A file of some planes without SH, on a coarser grid than that of the whole scene.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes ([width, n] f32 by field).
-    whole : GridScene
-        The whole scene.
-    settings : mapping
-        Of the file.
-    storage : Storage
-        Holds the grid.
+    `planes`: stored planes ([width, n] f32 by field). `whole`: the whole scene. `settings`: of the file. `storage`:
+    holds the grid.
     """
 
     def __init__(self, planes: Planes, whole: GridScene, settings: Mapping[str, Any], storage: Storage) -> None:

@@ -20,15 +20,15 @@ from flexgs_edge.methods.best.costs import (
     PART_NAMES,
     CostParts,
     RemovalCosts,
+    Snapshot,
     cost_bytes,
     cost_parts,
     cost_sums,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
+from flexgs_edge.methods.best.poses import KnownErrors
 from flexgs_edge.methods.best.refit.colour import normal_bytes, normal_sums, step_colours
-from flexgs_edge.methods.best.snapshot import Snapshot
-from flexgs_edge.methods.best.view_weights import KnownErrors
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.check import alive, invisible
@@ -42,10 +42,8 @@ PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
-PART_VIEWS = 48
-"""Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views"""
-SNAPSHOTS_HELD = 2
-"""So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go"""
+PART_VIEWS = 48  # Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views
+SNAPSHOTS_HELD = 2  # So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go
 
 
 def parts_of(views: int) -> int:
@@ -58,41 +56,20 @@ class PruneRounds:
 
     Where arrays lie in files, snapshots that a search hardly needs again let their planes go.
 
-    Parameters
-    ----------
-    original : Original
-        Scored poses and those between them. If colours are refitted, the original's renders are put into its references,
-        which are empty at first.
-    source : SceneSource
-        The whole scene. Neighbours in space become neighbours in memory, so that views are drawn faster.
-    refit : bool
-        Refit colours in each round (default).
-    unseen_share : float
-        Share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that are largest and most opaque
-        stay first.
-    checkpoint : Checkpoint, optional
-        Keeps every round. Rounds that it holds already are read instead of computed.
-
-    Attributes
-    ----------
-    rows : np.ndarray
-        [n] i64, rows of the scene that the rounds begin with, without dead splats, in the order of the planes.
-    snapshots : list of Snapshot
-        The results.
-    unseen : int
-        How many rows no scored pose sees.
-
-    Raises
-    ------
-    InputError
-        If nothing is left of the scene.
+    `original`: scored poses and those between them. If colours are refitted, the original's renders are put into its
+    references, which are empty at first. `source`: the whole scene. Neighbours in space become neighbours in memory, so
+    that views are drawn faster. `unseen_share`: share of the Gaussians that no pose sees to keep, 0 to 1 (default:
+    all). Those that are largest and most opaque stay first. `checkpoint`: keeps every round. Rounds that it holds
+    already are read instead of computed. `rows`: [n] i64, rows of the scene that the rounds begin with, without dead
+    splats, in the order of the planes. `snapshots`: the results. `unseen`: how many rows no scored pose sees. Raises
+    `InputError` if nothing is left of the scene.
     """
 
     def __init__(
         self,
         original: Original,
         source: SceneSource,
-        refit: bool = True,
+        refit: bool = True,  # refit colours in each round (default)
         unseen_share: float = 1.0,
         checkpoint: Checkpoint | None = None,
     ) -> None:
@@ -104,8 +81,7 @@ class PruneRounds:
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []
-        self._renewed: set[int] = set()
-        """Snapshots that a descent has made."""
+        self._renewed: set[int] = set()  # Snapshots that a descent has made
         if not self._resumed():
             self._begin(start, unseen_share)
         first = self.snapshots[0]
@@ -195,10 +171,8 @@ class PruneRounds:
     def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> Snapshot:
         """Append rows and planes that a descent has moved, with costs measured anew over all poses.
 
-        Parameters
-        ----------
-        change : callable
-            Makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a checkpoint has them.
+        `change`: makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a
+        checkpoint has them.
         """
         self._renewed.add(len(self.snapshots))
         if self._resumed():
@@ -213,14 +187,8 @@ class PruneRounds:
     def see(self, cameras: Sequence[Camera], number: int, known: KnownErrors | None) -> bool:
         """Score further poses, too, from snapshot `number` on; later ones are dropped. False if there are sets enough.
 
-        Parameters
-        ----------
-        cameras : sequence of Camera
-            The poses. They become a set of their own.
-        number : int
-            A snapshot that descents have made, or the first one. Its costs are measured anew.
-        known : KnownErrors or None
-            Descents look at poses by it.
+        `cameras`: the poses. They become a set of their own. `number`: a snapshot that descents have made, or the first
+        one. Its costs are measured anew. `known`: descents look at poses by it.
         """
         if len(self._views) >= MOST_PARTS:
             return False

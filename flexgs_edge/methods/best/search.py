@@ -10,68 +10,98 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.line import NEAREST, next_point, weighed
 from flexgs_edge.goals.promise import lost_views
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 
+NEAREST = 0.1
+"""A new point keeps this share of the interval between its neighbours away from both, since curves are not quite
+smooth."""
+
+
+def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.2) -> float:
+    """Position where the excess should be just below zero: false position, kept away from measured points.
+
+    `points`: (position, excess) of the measured points, at least one. `slope`: excess per position, used before two
+    points are measured. Its sign must be right. `stride`: largest move beyond all points; twice that once a slope has
+    been measured. `least`: a measured slope counts as at least this share of `slope`. Points that differ by chance have
+    no slope of their own.
+
+    >>> round(next_point([(0.0, -1.0), (1.0, 1.0)], 2.0, 1.0), 3)
+    0.495
+    """
+    points = sorted(points)
+    if slope < 0:
+        points.reverse()
+    # Sorted by rising excess, these are the last point that holds and the first one that misses.
+    first_miss = next((i for i, (_, excess) in enumerate(points) if excess > 0), len(points))
+    if 0 < first_miss < len(points):
+        (low, below), (high, above) = points[first_miss - 1], points[first_miss]
+        part = (AIM - below) / (above - below)
+        return low + (high - low) * min(max(part, NEAREST), 1 - NEAREST)
+    edge, excess = points[-1] if first_miss else points[0]
+    if len(points) > 1:
+        # The slope between the two points nearest to the target, kept within bounds.
+        (low, below), (high, above) = points[-2:] if first_miss else points[:2]
+        measured = (above - below) / (high - low) if high != low else slope
+        slope *= min(max(measured / slope, least), 3.0)
+        stride *= 2
+    return edge + max(-stride, min(stride, (AIM - excess) / slope))
+
+
+def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points for `next_point`; after several on one side, the other side's excess counts half for each beyond the first.
+
+    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target
+    slowly.
+    """
+    sides = [excess <= 0.0 for _, excess in points]
+    streak = next((count for count, side in enumerate(reversed(sides)) if side != sides[-1]), len(sides))
+    far = 0.5 ** (streak - 1)
+    return [
+        (position, excess * (1.0 if side == sides[-1] else far))
+        for (position, excess), side in zip(points, sides, strict=True)
+    ]
+
+
 LOG = logging.getLogger("flexgs_edge")
 
-Product = TypeVar("Product")
-"""Type of the product of a candidate: a grid, or a finished file."""
+Product = TypeVar("Product")  # Type of the product of a candidate: a grid, or a finished file
 
 MOST, MOST_TRIED = 4, 6
 """Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
 of both."""
-PROBES = 4
-"""Most probes before the first candidate."""
+PROBES = 4  # Most probes before the first candidate
 AIM, FARTHER = -0.01, 0.05
 """Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
 SLOPE, SIZE_SLOPE = 0.7, -0.45
 """Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
 docs/results/tuning.md#slope"""
-LARGEST_STRIDE = 1.2
-"""Largest change of the log of the multiplier beyond what is measured."""
-CLOSE_SIZE = 0.003
-"""A candidate that is smaller than asked by no more than this ends a search for a size."""
-LEAST_CHANGE = 1e-3
-"""Multipliers whose logs differ by less are the same."""
+LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what is measured
+CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than this ends a search for a size
+LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A finished result: coded and measured.
 
-    Parameters
-    ----------
-    multiplier : float
-        Squared error that a bit is worth.
-    count, sh_count : int
-        Gaussians kept, and those with SH.
-    size : int
-        Bytes of the file.
-    measurement : Measurement
-        Quality of the result.
-    excess : float
-        Log of the largest share: the target holds at zero or less.
-    seconds : float
-        Time that making and measuring took.
-    left_out : int
-        Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
+    `count`, `sh_count`: Gaussians kept, and those with SH.
     """
 
-    multiplier: float
+    multiplier: float  # squared error that a bit is worth
     count: int
     sh_count: int
-    size: int
-    measurement: Measurement
-    excess: float
-    seconds: float
+    size: int  # bytes of the file
+    measurement: Measurement  # quality of the result
+    excess: float  # log of the largest share: the target holds at zero or less
+    seconds: float  # time that making and measuring took
+    # Gaussians that no scored pose sees and that were left out because the grid would be coarser with them.
     left_out: int = 0
 
     @property
@@ -83,8 +113,7 @@ class Candidate:
 class Maker(Protocol[Product]):
     """Makes the candidates of a search."""
 
-    close: float
-    """How far below 1 the log of the largest share ends the search."""
+    close: float  # How far below 1 the log of the largest share ends the search
 
     def start(self, target: Target) -> float:
         """Prune, and return a multiplier to begin with."""
@@ -109,52 +138,24 @@ class Maker(Protocol[Product]):
 
 @dataclass(frozen=True)
 class RateResult(Generic[Product]):
-    """The answer of a search.
+    """The answer of a search."""
 
-    Parameters
-    ----------
-    product : Product
-        A grid, or a finished file.
-    chosen : Candidate
-        The best candidate, which `product` belongs to.
-    reached : bool
-        Whether it meets the target.
-    steps : tuple of Candidate
-        All candidates in the order of the search.
-    """
-
-    product: Product
-    chosen: Candidate
-    reached: bool
-    steps: tuple[Candidate, ...]
+    product: Product  # a grid, or a finished file
+    chosen: Candidate  # the best candidate, which `product` belongs to
+    reached: bool  # whether it meets the target
+    steps: tuple[Candidate, ...]  # all candidates in the order of the search
 
 
 def search(
-    maker: Maker[Product],
-    target: Target,
-    most: int = MOST,
-    best_effort: bool = False,
-    on_step: Callable[[Candidate], None] | None = None,
+    maker: Maker[Product],  # makes the candidates
+    target: Target,  # what must hold
+    most: int = MOST,  # most candidates, if one of them holds
+    best_effort: bool = False,  # answer with the closest candidate if none holds
+    on_step: Callable[[Candidate], None] | None = None,  # called with each candidate
 ) -> RateResult[Product]:
     """Search for the best candidate. An interrupted search answers with the best one so far.
 
-    Parameters
-    ----------
-    maker : Maker
-        Makes the candidates.
-    target : Target
-        What must hold.
-    most : int
-        Most candidates, if one of them holds.
-    best_effort : bool
-        Answer with the closest candidate if none holds.
-    on_step : callable, optional
-        Called with each candidate.
-
-    Raises
-    ------
-    TargetError
-        When no candidate holds and `best_effort` is not set; it names the closest one.
+    Raises `TargetError` when no candidate holds and `best_effort` is not set; it names the closest one.
     """
     steps: tuple[Candidate, ...] = ()
     best: tuple[Candidate, Product] | None = None
@@ -217,12 +218,7 @@ def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
 def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     """Log of the multiplier of the next candidate; `None` if another one would not be better.
 
-    Parameters
-    ----------
-    steps : sequence of Candidate
-        All so far, at least one.
-    target : Target
-        What must hold.
+    `steps`: all so far, at least one. `target`: what must hold.
     """
     by_size = target.limit_bytes is not None
     slope = SIZE_SLOPE if by_size else SLOPE

@@ -2,52 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from flexgs_edge.constants import SH_C0
+from flexgs_edge.goals.promise import bounds_ssim, mean_alone, means
+from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.allocation import BitModel, drop_bands, keep_most, keep_one
-from flexgs_edge.methods.best.costs import RemovalCosts
+from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.snapshot import Snapshot
+from flexgs_edge.scene.source import Planes
 
-MOST_ROUNDS = 24
-"""Most rounds of pruning."""
-FEW = 16
-"""Of fewer Gaussians none goes in a round."""
+MOST_ROUNDS = 24  # Most rounds of pruning
+FEW = 16  # Of fewer Gaussians none goes in a round
 ALL_LEFT = 0.97
 """A multiplier that keeps this share of what a descent has left asks for more: it chooses from what there was before."""
 
 
 @dataclass
 class Kept:
-    """The Gaussians that a multiplier keeps.
+    """The Gaussians that a multiplier keeps."""
 
-    Attributes
-    ----------
-    snapshot : int
-        Number of the snapshot that they were chosen from.
-    rows : np.ndarray
-        [n] i64, places in the rows of `PruneRounds`, ascending.
-    planes : dict
-        Stored planes of these rows ([width, n] f32 by field), with SH dropped.
-    degrees : np.ndarray
-        [n] u8, SH degrees.
-    weight2 : np.ndarray
-        [n] f64, sums of squared weights.
-    left_out : int
-        How many rows were left out because the grid would be coarser with them (`reachable`).
-    """
-
-    snapshot: int
-    rows: np.ndarray
-    planes: dict[str, np.ndarray]
-    degrees: np.ndarray
-    weight2: np.ndarray
-    left_out: int = 0
+    snapshot: int  # number of the snapshot that they were chosen from
+    rows: np.ndarray  # [n] i64, places in the rows of `PruneRounds`, ascending
+    planes: dict[str, np.ndarray]  # stored planes of these rows ([width, n] f32 by field), with SH dropped
+    degrees: np.ndarray  # [n] u8, SH degrees
+    weight2: np.ndarray  # [n] f64, sums of squared weights
+    left_out: int = 0  # how many rows were left out because the grid would be coarser with them (`reachable`)
 
     def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
         """The rows for which `keep` ([n] bool) is True."""
@@ -61,30 +47,15 @@ class Kept:
 
 @dataclass
 class Selection:
-    """Chooses from rounds of pruning.
+    """Chooses from rounds of pruning."""
 
-    Parameters
-    ----------
-    rounds : PruneRounds
-        More rounds are done when they are needed.
-    keep : float
-        Share that stays in a round.
-    choose : callable
-        Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier.
-    bits : BitModel
-        Bits of a Gaussian by SH degree.
-    most : int, optional
-        Most Gaussians (`--max-gaussians`).
-    begin : int
-        Snapshots before this one do not count: a descent has changed all costs since.
-    """
-
-    rounds: PruneRounds
-    keep: float
+    rounds: PruneRounds  # more rounds are done when they are needed
+    keep: float  # share that stays in a round
+    # Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier.
     choose: Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
-    bits: BitModel
-    most: int | None = None
-    begin: int = 0
+    bits: BitModel  # bits of a Gaussian by SH degree
+    most: int | None = None  # most Gaussians (`--max-gaussians`)
+    begin: int = 0  # snapshots before this one do not count: a descent has changed all costs since
 
     @property
     def last(self) -> Snapshot:
@@ -129,3 +100,53 @@ class Selection:
             if keep.mean() >= self.keep or snapshot.count < FEW:
                 break
         return index, keep, degrees
+
+
+LEAD_FROM = 1.0
+"""Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
+PRUNED_PART = 0.45
+"""Share of the allowed loss that pruning alone uses up when a candidate meets the target: docs/results/tuning.md#pruned_part"""
+
+
+class Measure(Protocol):
+    """Quality of planes ([width, n] f32 by field). With `estimate` it is a good guess that takes less time."""
+
+    def __call__(self, planes: Planes, estimate: bool = False) -> Measurement: ...
+
+
+class Guess:
+    """Guesses the excess of planes.
+
+    `measure`: quality of planes. `lead`: by how much SSIM is nearer to its bound than the mean, as a log. That changes
+    little with compression or by a refit, so it is not measured each time: docs/results/tuning.md#lead
+    """
+
+    def __init__(self, measure: Measure) -> None:
+        self._measure, self.lead = measure, 0.0
+
+    def __call__(self, planes: Planes, target: Target) -> float:
+        """Excess of planes by a target for quality, from the mean loss and the lead."""
+        return mean_alone(target).excess(0, self._measure(planes, estimate=True)) + self.lead
+
+    def learn(self, planes: Planes, target: Target) -> None:
+        """Measure the lead, if SSIM is bounded."""
+        if bounds_ssim(target):
+            quality = self._measure(planes)
+            self.lead = max(means(target).excess(0, quality) - mean_alone(target).excess(0, quality), 0.0)
+
+    def prune(self, selection: Selection, target: Target, part: float, times: float = 1.0) -> None:
+        """Prune until pruning alone loses `part` of what the target allows, or `times` the rows are left that a size allows."""
+        rounds, limit, end = selection.rounds, target.limit_bytes, math.log(part)
+
+        def enough(last: Snapshot) -> bool:
+            if limit is not None:
+                return last.count * selection.bits.base / 8 <= times * limit
+            if len(rounds.snapshots) == 1:
+                return False
+            excess = self(last.planes, target)
+            if self.lead == 0.0 and excess >= end - LEAD_FROM:
+                self.learn(last.planes, target)
+                excess += self.lead
+            return excess >= end
+
+        selection.prune(enough)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
-from flexgs_edge.memory.heap import return_freed_memory
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
@@ -46,8 +45,7 @@ from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
-COST_BYTES = 16
-"""Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision."""
+COST_BYTES = 16  # Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision
 BAND_BYTES = 20
 """Bytes of a row's costs in a snapshot for each SH degree: a cost in double precision, and a mean colour."""
 WORK_PLANES = 11
@@ -59,19 +57,10 @@ DESCENTS = 3
 candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
 """Bytes of memory that each row of a scene in scratch files still takes for a moment: for choosing rows, and lists of rows."""
-SPOOL_ROW_BYTES = 52
-"""Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows."""
+SPOOL_ROW_BYTES = 52  # Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows
 
 USUAL_SHARE = 4
 """Scratch files usually take one byte in so many of the most that they may take: docs/results/tuning.md#let_go"""
-
-
-def prepare_memory(run: Run[CompressOptions]) -> None:
-    """Have freed memory returned if the search will not fit into memory. Call this before the device is opened."""
-    source, options, budget = run.source, run.options, run.budget
-    rows = source.count
-    if options.method == "best" and rows * row_bytes(source.sh_degree, EFFORTS[options.effort].keep) > budget.free:
-        return_freed_memory()
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:
@@ -93,21 +82,8 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
-    Parameters
-    ----------
-    run : Run
-        Planned, with a scene.
-    renderer : Renderer
-        With nothing loaded.
-    scored : sequence of Camera
-        The scored poses.
-    folder : path
-        For scratch files.
-
-    Raises
-    ------
-    BudgetError
-        When not even the views fit, or the disk is too small.
+    `run`: planned, with a scene. `renderer`: with nothing loaded. `scored`: the scored poses. `folder`: for scratch
+    files. Raises `BudgetError` when not even the views fit, or the disk is too small.
     """
     source, options, budget = run.source, run.options, run.budget
     largest = largest_of(scored)

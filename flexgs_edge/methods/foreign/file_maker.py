@@ -36,38 +36,21 @@ LOG = logging.getLogger("flexgs_edge")
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """A finished file, and the size and quality of the scene that it decodes to.
+    """A finished file, and the size and quality of the scene that it decodes to."""
 
-    Parameters
-    ----------
-    path : Path
-        Where it lies.
-    size : int
-        Bytes.
-    count : int
-        Gaussians.
-    sh_count : int
-        Gaussians that had SH when they were written. (After decoding nobody knows: codebooks of `.sog` have no exact zero.)
-    sh_degree : int
-        SH degree of the decoded scene.
-    measurement : Measurement or None
-        Quality of the decoded file (`None` without views).
-    """
-
-    path: Path
-    size: int
-    count: int
+    path: Path  # where it lies
+    size: int  # bytes
+    count: int  # Gaussians
+    # Gaussians that had SH when they were written. (After decoding nobody knows: codebooks of `.sog` have no exact
+    # zero.).
     sh_count: int
-    sh_degree: int
-    measurement: Measurement | None
+    sh_degree: int  # SH degree of the decoded scene
+    measurement: Measurement | None  # quality of the decoded file (`None` without views)
 
 
 @contextmanager
 def open_files(
-    run: Run[CompressOptions],
-    format: Format,
-    bench: Bench | None = None,
-    judges: Judges | None = None,
+    run: Run[CompressOptions], format: Format, bench: Bench | None = None, judges: Judges | None = None
 ) -> Iterator[FileMaker]:
     """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
     output = run.output.path
@@ -80,28 +63,17 @@ def open_files(
 class FileMaker:
     """Writes candidates, reads them back and measures them.
 
-    Parameters
-    ----------
-    format : Format
-        What to write.
-    folder : Path
-        For the files.
-    budget : MemoryBudget
-        The memory that writing and reading back take is taken from it.
-    renderer, judge : Renderer, Judge or None
-        `None`: nothing is measured.
-    writing : Writing, optional
-        What the user says about the format.
+    `renderer`, `judge`: `None`: nothing is measured.
     """
 
     def __init__(
         self,
-        format: Format,
-        folder: Path,
-        budget: MemoryBudget,
+        format: Format,  # what to write
+        folder: Path,  # for the files
+        budget: MemoryBudget,  # the memory that writing and reading back take is taken from it
         renderer: Renderer | None,
         judge: Judge | None,
-        writing: Writing = PLAIN,
+        writing: Writing = PLAIN,  # what the user says about the format
     ) -> None:
         self.format, self.folder, self.writing = format, folder, writing
         self._budget, self._renderer, self._judge = budget, renderer, judge

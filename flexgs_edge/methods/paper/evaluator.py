@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.codec.v1.header import container_size
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import Measurement
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
@@ -18,44 +18,23 @@ from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantiz
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
-QUANTIZE_COPIES = 4
-"""Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between."""
+QUANTIZE_COPIES = 4  # Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A scene and the order in which its rows are pruned.
+    """A scene and the order in which its rows are pruned."""
 
-    Parameters
-    ----------
-    source : SceneSource
-        The original.
-    order : np.ndarray
-        [N] i64, least important row first.
-    has_sh : np.ndarray
-        [N] bool, rows with SH that are not zero.
-    """
-
-    source: SceneSource
-    order: np.ndarray
-    has_sh: np.ndarray
+    source: SceneSource  # the original
+    order: np.ndarray  # [N] i64, least important row first
+    has_sh: np.ndarray  # [N] bool, rows with SH that are not zero
 
 
 class SceneEvaluator:
     """Prunes by rank, quantizes, and asks the judge; see `flexgs_edge.goals.Evaluator`.
 
-    Parameters
-    ----------
-    ranked : Ranked
-        The scene.
-    bits : BitSpec
-        Bits per code.
-    groups : int or None
-        As for `quantize_scene`.
-    judge : Judge or None
-        Draws and compares. Without one, `measure` and `estimate` fail.
-    budget : MemoryBudget
-        The quantized scene is taken from it.
+    `ranked`: the scene. `bits`: bits per code. `groups`: as for `quantize_scene`. `judge`: draws and compares. Without
+    one, `measure` and `estimate` fail. `budget`: the quantized scene is taken from it.
     """
 
     def __init__(

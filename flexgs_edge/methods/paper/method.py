@@ -15,25 +15,51 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, Step, step_words
-from flexgs_edge.methods.paper.auto_bits import bits_by_sensitivity
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.score_cache import score_cache
 from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
-from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity, search_bits
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
-from flexgs_edge.packed.sensitivity import Sensitivity
+from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.quality.view_quality import Quality
-from flexgs_edge.run.decoding import decode_bytes
+from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
+from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
 from flexgs_edge.views.bench import Bench
+
+SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
+
+
+def bits_by_sensitivity(
+    evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
+) -> tuple[BitSpec, list[Sensitivity]]:
+    """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
+    renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
+    count = min(SENSITIVITY_VIEWS, len(views.train))
+    indices = [views.train[i * len(views.train) // count] for i in range(count)]
+    judge = Judge(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
+    with renderer.load(source) as original:
+        judge.prepare(original, run.progress)
+
+    def error(bits: BitSpec) -> float:
+        with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
+            return judge.compare(scene).deciding_error
+
+    kept, with_sh = evaluator.counts(EVERYTHING)
+    bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, base_psnr))
+    judge.close()
+    LOG.info("bits found by sensitivity: %s", bits)
+    return bits, found
+
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -43,30 +69,21 @@ RANK_ROW_BYTES = 36
 
 @dataclass(frozen=True)
 class Ranking:
-    """The order in which rows are pruned.
+    """The order in which rows are pruned."""
 
-    Parameters
-    ----------
-    order : np.ndarray
-        [N] i64, rows of the scene, least important first.
-    reused : bool
-        Whether their scores came from the cache.
-    """
-
-    order: np.ndarray
-    reused: bool = False
+    order: np.ndarray  # [N] i64, rows of the scene, least important first
+    reused: bool = False  # whether their scores came from the cache
 
 
 def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """Compress a scene into a `.fgs` of version 1.
 
-    Parameters
-    ----------
-    run : Run
-        Planned.
-    bench : Bench or None
-        Draws the views; `None` for runs without views, whose rates are fixed.
+    `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
     """
+    if bench is not None:
+        with run.clock.stage("open"):  # the search reads the scene for every choice that it measures
+            source = read_often(run.source, run.budget, searching_bytes(run), bench.renderer.backend)
+            run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
     with nullcontext() if bench is None else Judges(run, bench) as judges:
         ranking = _rank(run, judges, bench)
@@ -159,10 +176,7 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
 
 
 def _write(
-    run: Run[CompressOptions],
-    quantized: QuantizedScene,
-    search: SearchResult | None,
-    judges: Judges | None,
+    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Judges | None
 ) -> Quality | None:
     """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
     settings, output = make_settings(run, search, quantized.bits), run.output.path

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource
@@ -20,20 +20,8 @@ if TYPE_CHECKING:
 def order_from_scores(scores: np.ndarray) -> np.ndarray:
     """Rows from the least to the most important; ties by index.
 
-    Parameters
-    ----------
-    scores : np.ndarray
-        [N] f64; infinities are allowed.
-
-    Returns
-    -------
-    np.ndarray
-        [N] i64.
-
-    Raises
-    ------
-    InputError
-        When a score is NaN, because its place would depend on the sort.
+    `scores`: [N] f64; infinities are allowed. Returns [N] i64. Raises `InputError` when a score is NaN, because its
+    place would depend on the sort.
     """
     scores = np.asarray(scores, np.float64)
     if scores.ndim != 1:
@@ -58,19 +46,8 @@ def select_rows(ranks: np.ndarray, choice: Choice, has_sh: np.ndarray | None = N
     `choice.boundary(N)` lose their SH. A kept row whose SH are all zero joins the block without SH, whatever its rank;
     it takes no other row's place there.
 
-    Parameters
-    ----------
-    ranks : np.ndarray
-        [N] i64, from `ranks_from_order`.
-    choice : Choice
-        The rates.
-    has_sh : np.ndarray, optional
-        [N] bool, false where all SH above degree 0 are zero (`nonzero_sh`). Default: all true.
-
-    Returns
-    -------
-    tuple of np.ndarray
-        Rows with SH and rows without, both [n] i64 ascending.
+    `ranks`: [N] i64, from `ranks_from_order`. `choice`: the rates. `has_sh`: [N] bool, false where all SH above degree
+    0 are zero (`nonzero_sh`). Default: all true. Returns rows with SH and rows without, both [n] i64 ascending.
     """
     if has_sh is not None and len(has_sh) != len(ranks):
         raise InputError(f"has_sh: expected {len(ranks)} rows, got {len(has_sh)}")

@@ -18,12 +18,7 @@ from flexgs_edge.run.run import Run
 class ScoreCache:
     """A file with the scores of one scene seen from one set of poses.
 
-    Parameters
-    ----------
-    path : path
-        Made by `save`. It need not exist.
-    fingerprint : str
-        Of the scene, poses and kind of score.
+    `path`: made by `save`. It need not exist. `fingerprint`: of the scene, poses and kind of score.
     """
 
     def __init__(self, path: str | Path, fingerprint: str) -> None:
@@ -32,10 +27,7 @@ class ScoreCache:
     def load(self, count: int) -> np.ndarray | None:
         """[count] f64, or `None` if there is no file yet or its fingerprint differs.
 
-        Raises
-        ------
-        InputError
-            When `save` did not write the file, because the run would overwrite it.
+        Raises `InputError` when `save` did not write the file, because the run would overwrite it.
         """
         try:
             with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as archive:

@@ -16,47 +16,23 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
 
 SCORES = ("gs", "meson")
-ROWS = 1 << 16
-"""Rows of the scene read at a time."""
-SCORE_ROW_BYTES = 28
-"""Bytes a Gaussian that scoring holds: hits and weights, and what one view adds to them."""
+ROWS = 1 << 16  # Rows of the scene read at a time
+SCORE_ROW_BYTES = 28  # Bytes a Gaussian that scoring holds: hits and weights, and what one view adds to them
 
 
 def score_scene(
-    renderer: Renderer,
-    scene: DeviceScene,
-    source: SceneSource,
-    cameras: Sequence[Camera],
+    renderer: Renderer,  # draws the views
+    scene: DeviceScene,  # loaded from `source`
+    source: SceneSource,  # read again for opacities and volumes, `ROWS` rows at a time
+    cameras: Sequence[Camera],  # the training poses
     kind: str = "gs",
-    progress: Progress = SILENT,
+    progress: Progress = SILENT,  # told of each view
 ) -> np.ndarray:
     """Log of the importance of every Gaussian. Only the order matters, and a log cannot underflow for tiny volumes.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        Draws the views.
-    scene : DeviceScene
-        Loaded from `source`.
-    source : SceneSource
-        Read again for opacities and volumes, `ROWS` rows at a time.
-    cameras : sequence of Camera
-        The training poses.
-    kind : {"gs", "meson"}
-        `gs`: opacity * volume^0.1 * hits (LightGaussian, FlexGaussian). `meson`: volume^0.1 * sum(alpha T) (MesonGS).
-        Default: `gs`.
-    progress : Progress
-        Told of each view.
-
-    Returns
-    -------
-    np.ndarray
-        [N] f64; -inf for Gaussians that no pose sees.
-
-    Raises
-    ------
-    InputError
-        For an unknown kind, or when no camera sees any Gaussian.
+    `kind` ({"gs", "meson"}): `gs`: opacity * volume^0.1 * hits (LightGaussian, FlexGaussian). `meson`: volume^0.1 *
+    sum(alpha T) (MesonGS). Default: `gs`. Returns [N] f64; -inf for Gaussians that no pose sees. Raises `InputError`
+    for an unknown kind, or when no camera sees any Gaussian.
     """
     if kind not in SCORES:
         raise InputError(f"score {kind!r}: expected one of {', '.join(SCORES)}")

@@ -21,24 +21,63 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import MAX_PRUNE, REFINE_STEPS, Phase, SearchResult, Step, out_of_reach
+from flexgs_edge.goals.steps import MAX_PRUNE, REFINE_STEPS, Choice, Phase, SearchResult, Step, out_of_reach
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.paper.loss_model import LossModel
+
+PRIOR_SLOPES = (5.0, 2.0)
+"""Excess (log of loss over limit) for each unit of prune rate and SH rate, before anything is measured:
+docs/results/tuning.md#prior_slopes"""
+PRIOR_WEIGHT = 1e-3
+"""Weight of the prior slopes, in measured points at the limit. They decide only where points leave a slope open."""
+WIDTH = 0.5
+"""Excess at which a measured point weighs 1/e of one at the limit, because the model need only be right near the limit."""
+
+
+@dataclass(frozen=True)
+class LossModel:
+    """excess = constant + prune * p + sh * s, with prune rate p and SH rate s in 0..1."""
+
+    constant: float
+    prune: float
+    sh: float
+
+    @classmethod
+    def fit(cls, points: list[tuple[Choice, float]]) -> LossModel:
+        """Fit `points` by weighted least squares; the prior slopes decide where points leave a direction open.
+
+        Slopes stay at or above zero, because more compression never gains quality.
+        """
+        rows = [(c.prune / 1000.0, c.sh / 1000.0, e, math.exp(-min(abs(e) / WIDTH, 6.0))) for c, e in points]
+        weight = math.fsum(w for *_, w in rows)
+        mean_p = math.fsum(w * p for p, _, _, w in rows) / weight
+        mean_s = math.fsum(w * s for _, s, _, w in rows) / weight
+        mean_e = math.fsum(w * e for _, _, e, w in rows) / weight
+        pp = PRIOR_WEIGHT + math.fsum(w * (p - mean_p) ** 2 for p, _, _, w in rows)
+        ss = PRIOR_WEIGHT + math.fsum(w * (s - mean_s) ** 2 for _, s, _, w in rows)
+        ps = math.fsum(w * (p - mean_p) * (s - mean_s) for p, s, _, w in rows)
+        pe = PRIOR_WEIGHT * PRIOR_SLOPES[0] + math.fsum(w * (p - mean_p) * (e - mean_e) for p, _, e, w in rows)
+        se = PRIOR_WEIGHT * PRIOR_SLOPES[1] + math.fsum(w * (s - mean_s) * (e - mean_e) for _, s, e, w in rows)
+        determinant = pp * ss - ps * ps
+        slope_p = max((pe * ss - se * ps) / determinant, 0.0)
+        slope_s = max((se * pp - pe * ps) / determinant, 0.0)
+        return cls(mean_e - slope_p * mean_p - slope_s * mean_s, slope_p, slope_s)
+
+    def predict(self, choice: Choice) -> float:
+        """Expected excess at `choice`."""
+        return self.constant + (self.prune * choice.prune + self.sh * choice.sh) / 1000.0
+
 
 CANDIDATES: tuple[tuple[int, int], ...] = (
     (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
     (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
 )  # fmt: skip
 """The paper's list of (p, s), in tenths, as published. It is not sorted by bytes; the search sorts it."""
-START = (4, 4)
-"""Where the walk along the list begins, in tenths."""
-GRID = 20
-"""Step of the refinement in p and s, in thousandths."""
-REACH = 100
-"""Largest distance of the refinement from the list's answer, in thousandths."""
+START = (4, 4)  # Where the walk along the list begins, in tenths
+GRID = 20  # Step of the refinement in p and s, in thousandths
+REACH = 100  # Largest distance of the refinement from the list's answer, in thousandths
 
 
 class Evaluator(Protocol):
@@ -55,34 +94,16 @@ class Evaluator(Protocol):
 
 
 def adapt(
-    evaluator: Evaluator,
-    target: Target,
-    effort: str = "balanced",
-    best_effort: bool = False,
-    on_step: Callable[[Step], None] | None = None,
-    rows: int | None = None,
+    evaluator: Evaluator,  # Answers for sizes, estimates and measurements. No question is asked twice.
+    target: Target,  # what must hold
+    effort: str = "balanced",  # Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
+    best_effort: bool = False,  # return the closest point with `reached` False when nothing holds
+    on_step: Callable[[Step], None] | None = None,  # called after each new step
+    rows: int | None = None,  # rows of the scene; an error then says if one Gaussian is left
 ) -> SearchResult:
     """Find the choice that meets `target` with the fewest bytes (for a size target: with the best quality).
 
-    Parameters
-    ----------
-    evaluator : Evaluator
-        Answers for sizes, estimates and measurements. No question is asked twice.
-    target : Target
-        What must hold.
-    effort : {"fast", "balanced", "max"}
-        Number of refinement steps (`REFINE_STEPS`). Default: `balanced`.
-    best_effort : bool
-        Return the closest point with `reached` False when nothing holds.
-    on_step : callable, optional
-        Called after each new step.
-    rows : int, optional
-        Rows of the scene; an error then says if one Gaussian is left.
-
-    Raises
-    ------
-    TargetError
-        When no point holds and `best_effort` is not set; the message names the closest point.
+    Raises `TargetError` when no point holds and `best_effort` is not set; the message names the closest point.
     """
     search = _Search(evaluator, target, on_step)
     refine_steps = REFINE_STEPS[effort]

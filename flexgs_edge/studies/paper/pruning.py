@@ -6,19 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, PlaneChart, Series
 from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
-DIAGONAL = tuple(range(50, 501, 50))
-"""Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split."""
-GRID = 100
-"""Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid."""
-MAX_ROWS = 980
-"""Largest rate of pruning rows alone, in thousandths."""
+DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.
+GRID = 100  # Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid.
+MAX_ROWS = 980  # Largest rate of pruning rows alone, in thousandths
 RATES = {"prune_rate": "p (removed)", "sh_rate": "s (SH removed)"}
 
 
@@ -133,12 +130,7 @@ def plane(studied: StudyScene) -> Experiment:
         # Steps of the list and of the refinement are estimates, because the search saw only these.
         kind = "answer" if step is search.chosen else step.phase
         rows.append(
-            {
-                "kind": kind,
-                "step": number,
-                **_rates(step.choice),
-                **studied.figures(step.size, step.measurement),
-            }
+            {"kind": kind, "step": number, **_rates(step.choice), **studied.figures(step.size, step.measurement)}
         )
     figure = studied.figure
     limit = getattr(studied.target, "limit", None)

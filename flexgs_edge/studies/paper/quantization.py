@@ -13,8 +13,7 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RTN_BITS = tuple(range(2, 9))
-FINE = BitSpec.rtn(16)
-"""Stands for unquantized values: 16 bits in sub-groups lose less than renders show."""
+FINE = BitSpec.rtn(16)  # Stands for unquantized values: 16 bits in sub-groups lose less than renders show
 ALONE_BITS = (4, 8)
 PAPER_GROUPS = 1000
 NAMES = {"xyz": "position", "dc": "colour", "rest": "SH", "opacity": "opacity", "scale": "scale", "rot": "rotation"}

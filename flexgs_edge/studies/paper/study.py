@@ -10,22 +10,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_folder, check_folder
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.report.run_info import record
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.page import study_page
 from flexgs_edge.studies.paper import pruning, quantization, whole
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
-from flexgs_edge.studies.written import SceneStudy, write_scene
+from flexgs_edge.studies.written import SceneStudy, write_page, write_scene
 
 LOG = logging.getLogger("flexgs_edge")
 
-Maker = Callable[[StudyScene], Experiment]
-"""Makes an experiment on a scene."""
+Maker = Callable[[StudyScene], Experiment]  # Makes an experiment on a scene
 EXPERIMENTS: tuple[Maker, ...] = (
     quantization.rtn,
     quantization.attributes,
@@ -48,12 +46,7 @@ class PaperStudy:
 
     def to_json(self) -> dict[str, Any]:
         """The record for programs."""
-        return {
-            "program": f"flexgs-edge {__version__}",
-            "command": "study paper",
-            "output": self.output,
-            "scenes": [scene.to_json() for scene in self.scenes],
-        }
+        return record("study paper", self)
 
     def to_text(self) -> str:
         """The findings, for people."""
@@ -71,10 +64,8 @@ def study_paper(
 ) -> PaperStudy:
     """Make the paper's experiments on every scene and write them to a folder.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "paper"})
     experiments = EXPERIMENTS if experiments is None else experiments
@@ -119,5 +110,4 @@ def _write(folder: Path, scenes: Sequence[SceneStudy]) -> None:
         "containers and quality figures. Sizes are bytes of the finished file. Ratios are to the PLY as INRIA writes it. The "
         "paper's figures are means over its own scenes, so beside one scene they only give the order of magnitude."
     )
-    page = study_page("The paper's evaluation", intro, sections)
-    (folder / "index.html").write_text(page, encoding="utf-8")
+    write_page(folder, "The paper's evaluation", intro, sections)

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import MAX_PRUNE
+from flexgs_edge.goals.steps import MAX_PRUNE, Choice
 from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
@@ -22,16 +21,13 @@ from flexgs_edge.studies.result_tables import Cell, Table, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)
-"""The strongest compression that the search may choose."""
+STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)  # The strongest compression that the search may choose
 PAPER_MEANS = ([100 / (100 - saved) for saved in (94.9, 96.1, 96.4)], [0.87, 0.86, 0.85])
 """The paper's mean ratios and drops on Mip-NeRF360, Tanks&Temples and Deep Blending."""
-REPEATS = 5
-"""How often the parts of a step are timed. The median is shown."""
+REPEATS = 5  # How often the parts of a step are timed. The median is shown.
 PAPER_STEP = {"prune": 0.22, "quantize": 0.84, "dequantize": 0.32, "render and compare": 0.18}
 """Published seconds of the parts of a search step on an RTX 3090, rendering 32 views."""
-PAPER_STEP_ALL = 1.56
-"""Published seconds of a whole step there."""
+PAPER_STEP_ALL = 1.56  # Published seconds of a whole step there
 
 
 class Unquantized(SceneSource):
@@ -228,11 +224,7 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
     ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = (
-        studied.evaluator(Setting(choice)),
-        studied.bench.renderer,
-        studied.judge.cameras[0],
-    )
+    evaluator, renderer, first = (studied.evaluator(Setting(choice)), studied.bench.renderer, studied.judge.cameras[0])
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
         select_rows(ranks, choice, studied.has_sh)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import MaxSize, min_ratio
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
@@ -27,49 +27,28 @@ from flexgs_edge.run.outputs import Output
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.studies.rate.ablations import WHOLE, Variant
 from flexgs_edge.studies.result_tables import Cell, Column, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
-MAX = "max"
-"""The effort that distils. It gets a curve of its own."""
+MAX = "max"  # The effort that distils. It gets a curve of its own.
+WHOLE, UNPRUNED = "whole", "nothing pruned"
 
 
 @dataclass(frozen=True)
 class RatePoint:
-    """A file and its quality.
+    """A file and its quality."""
 
-    Parameters
-    ----------
-    method : str
-        `best`, `paper`, or the format of another program.
-    variant : str
-        The part that was taken away, or `whole`.
-    effort : str or None
-        Effort of the search, if there was one.
-    wanted : float or None
-        The ratio that was asked for.
-    size : int
-        Bytes of the file.
-    kept : int
-        Gaussians in the file.
-    quality : Quality
-        Over the views that decide, with SSIM and FLIP.
-    seconds : float or None
-        Time of the search or conversion, without measuring the final quality.
-    """
-
-    method: str
-    variant: str
-    effort: str | None
-    wanted: float | None
-    size: int
-    kept: int
-    quality: Quality
-    seconds: float | None
+    method: str  # `best`, `paper`, or the format of another program
+    variant: str  # `whole`, or what was left out
+    effort: str | None  # effort of the search, if there was one
+    wanted: float | None  # the ratio that was asked for
+    size: int  # bytes of the file
+    kept: int  # Gaussians in the file
+    quality: Quality  # over the views that decide, with SSIM and FLIP
+    seconds: float | None  # time of the search or conversion, without measuring the final quality
 
     @property
     def ssim(self) -> float | None:
@@ -82,8 +61,7 @@ class RatePoint:
         return self.quality.flip_original if self.quality.flip_photo is None else self.quality.flip_photo
 
 
-PEERS = (".spz", ".sog", ".compressed.ply")
-"""Formats of other programs that the study compares with."""
+PEERS = (".spz", ".sog", ".compressed.ply")  # Formats of other programs that the study compares with
 
 
 @dataclass(frozen=True)
@@ -163,29 +141,15 @@ def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, secon
     with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
         quality = _judged(studied, scene)
     kept, _ = evaluator.counts(choice)
-    variant = WHOLE.name if ratio is not None else "nothing pruned"
+    variant = WHOLE if ratio is not None else UNPRUNED
     effort = None if ratio is None else studied.run.options.effort
     return _said(RatePoint("paper", variant, effort, ratio, evaluator.size(choice), kept, quality, seconds))
 
 
-def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequence[float]) -> Found:
-    """Points of `--method best`, whole or without a part. All ratios share their rounds, the weakest compression first.
-
-    Parameters
-    ----------
-    studied : StudyScene
-        The scene.
-    variant : Variant
-        The method, or the method without a part.
-    effort : str
-        Effort of the searches.
-    ratios : sequence of float
-        PLY bytes over file bytes, one search for each.
-    """
+def best_points(studied: StudyScene, effort: str, ratios: Sequence[float]) -> Found:
+    """Points of `--method best`. All ratios share their rounds, the weakest compression first."""
     run, source = studied.run, studied.run.source
-    options = replace(studied.run.options, effort=effort, refit=variant.refit, best_effort=True)
-    if variant.distil is not None:
-        options = replace(options, distil=variant.distil)
+    options = replace(studied.run.options, effort=effort, best_effort=True)
     # All sizes share their rounds, and so their poses: those of the largest size.
     largest = replace(
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
@@ -195,21 +159,21 @@ def best_points(studied: StudyScene, variant: Variant, effort: str, ratios: Sequ
     found = NOTHING
     started = time.perf_counter()
     run = replace(run, options=options)
-    with open_rounds(run, studied.bench, poses.cameras, variant.path, known=poses.known) as rounds:
+    with open_rounds(run, studied.bench, poses.cameras, known=poses.known) as rounds:
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))
             coder = GridCoder(studied.bench.renderer, settings_room(aimed))
-            make = grid_maker(options, coder, variant.search)
+            make = grid_maker(options, coder)
             with run.clock.stage("search"):
                 grid, search = search_rounds(make, rounds, aimed, studied.judge)
             seconds = time.perf_counter() - started
             if search.reached:
                 size = coder.size(grid, make_settings(aimed, search))
                 quality = _judged_source(studied, grid)
-                point = RatePoint("best", variant.name, effort, ratio, size, grid.count, quality, seconds)
+                point = RatePoint("best", WHOLE, effort, ratio, size, grid.count, quality, seconds)
                 found += Found((_said(point),))
             else:
-                found += Found((), (f"best ({variant.name}, {effort}) at {ratio:g}x",))
+                found += Found((), (f"best ({effort}) at {ratio:g}x",))
             started = time.perf_counter()
     return found
 
@@ -238,7 +202,7 @@ def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> 
         seconds = time.perf_counter() - started
         with studied.bench.renderer.load(decoded) as scene:
             quality = _judged(studied, scene)
-        return RatePoint(name, WHOLE.name, None, None, path.stat().st_size, decoded.count, quality, seconds)
+        return RatePoint(name, WHOLE, None, None, path.stat().st_size, decoded.count, quality, seconds)
 
 
 def _target(studied: StudyScene, ratio: float) -> MaxSize:

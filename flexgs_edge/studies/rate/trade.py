@@ -1,16 +1,53 @@
-"""Experiments on bytes and quality: all methods side by side, and the bytes that each part of `best` saves."""
+"""Experiments on bytes and quality: all methods side by side."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from flexgs_edge.report.plots import BarChart, LineChart, Series
+import numpy as np
+
+from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.rate.ablations import WHOLE, Variant
-from flexgs_edge.studies.rate.curves import Curve
-from flexgs_edge.studies.rate.points import MAX, RatePoint, loss_of, point_columns, point_row
-from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
+from flexgs_edge.studies.rate.points import MAX, WHOLE, RatePoint, loss_of, point_columns, point_row
+from flexgs_edge.studies.result_tables import Cell, Table, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
+
+LEAST_LOSS = 0.001
+"""Points with less loss than this, in dB, are left out. Loss and bytes are interpolated on log scales, because such curves are
+nearly power laws."""
+SLACK = 1e-9  # Tolerance, so that the curve's own points lie on it in spite of rounding
+
+
+class Curve:
+    """Bytes and loss of one method at several sizes.
+
+    `points`: bytes and dB.
+    """
+
+    def __init__(self, points: Iterable[tuple[int, float]]) -> None:
+        known = sorted((size, loss) for size, loss in points if loss >= LEAST_LOSS)
+        self._sizes = np.log([size for size, _ in known])
+        # With noise a smaller file may be the better one. The smaller file then counts.
+        self._losses = np.minimum.accumulate(np.log([loss for _, loss in known]))
+
+    def loss(self, size: int) -> float | None:
+        """Loss in dB of a file of `size` bytes; None beyond the curve's ends."""
+        place = float(np.log(size))
+        if not len(self._sizes) or not self._sizes[0] - SLACK <= place <= self._sizes[-1] + SLACK:
+            return None
+        return float(np.exp(np.interp(place, self._sizes, self._losses)))
+
+    def size(self, loss: float) -> float | None:
+        """Fewest bytes at `loss` dB; None beyond the curve's ends."""
+        place = float(np.log(max(loss, 1e-12)))
+        if not len(self._sizes) or not self._losses[-1] - SLACK <= place <= self._losses[0] + SLACK:
+            return None
+        after = int(np.flatnonzero(self._losses <= place + SLACK)[0])
+        if after == 0:
+            return float(np.exp(self._sizes[0]))
+        ends = slice(after - 1, after + 1)
+        return float(np.exp(np.interp(-place, -self._losses[ends], self._sizes[ends])))
+
 
 FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
@@ -31,7 +68,7 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
         "Bytes and quality",
         f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
-        f"{against}; {FIDELITY_WORDS}. The rows hold all points of this study, also those without a part of the method. "
+        f"{against}; {FIDELITY_WORDS}. "
         "The first seconds of a curve include most of the rounds of pruning, which its other points share.",
         table,
         _chart(table, "Bytes and quality", figure, effort),
@@ -67,7 +104,7 @@ def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> E
 
 
 def _on_curve(method: str, variant: str, effort: str | None, wanted: str) -> bool:
-    return method != "best" or (variant == WHOLE.name and effort in (wanted, MAX))
+    return method != "best" or (variant == WHOLE and effort in (wanted, MAX))
 
 
 def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
@@ -103,8 +140,8 @@ def _note(row: dict[str, Cell]) -> str:
 def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> Iterable[str]:
     """Sentences that compare best with each other method and effort, at equal loss."""
     figure = FIGURES[studied.figure].removesuffix(" (dB)")
-    best = _points(points, "best", WHOLE.name, effort)
-    paper = {point.wanted: point for point in _points(points, "paper", WHOLE.name, effort)}
+    best = _points(points, "best", WHOLE, effort)
+    paper = {point.wanted: point for point in _points(points, "paper", WHOLE, effort)}
     pairs = [(point, paper[point.wanted]) for point in best if point.wanted in paper]
     if pairs:
         words = ", ".join(f"{a.wanted:g}x: {loss_of(studied, a):.2f} / {loss_of(studied, b):.2f} dB" for a, b in pairs)
@@ -123,11 +160,11 @@ def _comparisons(studied: StudyScene, points: Sequence[RatePoint], effort: str) 
                 f"best needs {share:.0%} of its bytes there" if share is not None else "beyond the ends of best's curve"
             )
             yield f"{point.method}: {studied.run.scene.ply_bytes / point.size:.1f}x at {loss:.3f} dB of {figure}; {than}."
-    others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE.name} - {None})
+    others = sorted({p.effort for p in points if p.effort not in (None, effort) and p.variant == WHOLE} - {None})
     whole = _modelled(best)
     for other in others:
         # Efforts differ by few bytes. The drop against photos is too noisy to tell.
-        known = [_more(p.size, whole.size(p.quality.modelled_drop)) for p in _points(points, "best", WHOLE.name, other)]
+        known = [_more(p.size, whole.size(p.quality.modelled_drop)) for p in _points(points, "best", WHOLE, other)]
         costs = [cost for cost in known if cost is not None]
         if costs:
             yield (
@@ -154,88 +191,6 @@ def _share(studied: StudyScene, curve: Curve, point: RatePoint) -> float | None:
     return None if size is None else size / point.size
 
 
-def parts(
-    studied: StudyScene, points: Sequence[RatePoint], variants: Sequence[Variant], effort: str, ratios: Sequence[float]
-) -> Experiment:
-    """Compare the method without each part with the whole method, at equal loss and at equal bytes."""
-    figure = FIGURES[studied.figure].removesuffix(" (dB)")
-    whole = _points(points, "best", WHOLE.name, effort)
-    curve = _curve(studied, whole)
-    modelled = _modelled(whole)
-    known = {variant.name: variant.words for variant in (WHOLE, *variants)}
-    rows: list[dict[str, Cell]] = []
-    for name, words in known.items():
-        for point in _points(points, "best", name, effort):
-            if point.wanted in ratios:
-                rows.append(_part_row(studied, curve, modelled, point, words))
-    heads = columns(
-        variant="taken away",
-        instead="in its place",
-        wanted_ratio="ratio wanted",
-        **FIGURES,
-        more_bytes=f"more bytes at equal {figure} (%)",
-        more_modelled="more bytes at equal modelled drop (%)",
-        more_loss=f"more dB of {figure} at equal bytes",
-    )
-    table = Table(heads, tuple(rows))
-    names = [name for name in known if name != WHOLE.name and table.values("variant", variant=name)]
-    return Experiment(
-        "parts",
-        "Each part earns its place",
-        f"best with one part taken away at a time, at the effort {effort}, compared with the whole method at that effort. "
-        "Power laws join the whole method's points. A dash means beyond the whole method's points. Drops of a few "
-        "hundredths of a dB are mostly chance; the modelled drop is then the steadier figure.",
-        table,
-        BarChart(
-            "What it costs to leave a part out",
-            f"more bytes at equal {figure}, %",
-            [_broken(name) for name in names],
-            {
-                f"{ratio:g}x": [
-                    next(iter(table.values("more_bytes", variant=n, wanted_ratio=ratio)), None) for n in names
-                ]
-                for ratio in ratios
-            },
-            digits=1,
-        ),
-        tuple(_part_words(table, name, figure) for name in names),
-    )
-
-
-def _part_row(studied: StudyScene, curve: Curve, modelled: Curve, point: RatePoint, words: str) -> dict[str, Cell]:
-    row = point_row(studied, point)
-    loss = curve.loss(point.size)
-    return {
-        "variant": point.variant,
-        "instead": words,
-        "wanted_ratio": point.wanted,
-        **{name: row[name] for name in FIGURES},
-        "more_bytes": _more(point.size, curve.size(loss_of(studied, point))),
-        "more_modelled": _more(point.size, modelled.size(point.quality.modelled_drop)),
-        "more_loss": None if loss is None else round(loss_of(studied, point) - loss, 4) + 0.0,
-    }
-
-
 def _more(size: int, whole: float | None) -> float | None:
     """By how many per cent `size` is larger than `whole`."""
     return None if whole is None else round(100 * size / whole - 100, 2) + 0.0  # no -0.0
-
-
-def _part_words(table: Table, name: str, figure: str) -> str:
-    words = []
-    for row in table.rows:
-        if row["variant"] == name:
-            more = (
-                "beyond the curve"
-                if row["more_bytes"] is None
-                else f"{row['more_bytes']:+.1f} % bytes at equal {figure}"
-            )
-            loss = "" if row["more_loss"] is None else f" ({row['more_loss']:+.3f} dB at equal bytes)"
-            words.append(f"{row['wanted_ratio']:g}x {more}{loss}")
-    return f"{name}: {'; '.join(words)}."
-
-
-def _broken(name: str) -> str:
-    """The name in two lines, for the foot of a bar."""
-    first, _, rest = name.partition(" ")
-    return f"{first}\n{rest}" if rest else first

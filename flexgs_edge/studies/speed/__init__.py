@@ -1,1 +1,1 @@
-"""`study speed`: how much quality less work costs, and where time is spent."""
+"""`study speed`: how much time each method and effort takes, and what it finds."""

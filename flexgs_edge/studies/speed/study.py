@@ -1,31 +1,28 @@
-"""`study speed`: how much accuracy speed costs in drawing, scoring and whole runs."""
+"""`study speed`: how much time each method and effort of `compress` takes, and the ratio that it finds."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.errors import InputError
-from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.commands.compress import compress
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.report.plots import require_matplotlib
+from flexgs_edge.report.plots import LineChart, Series
+from flexgs_edge.report.results import CompressResult, decided_words
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.page import study_page
-from flexgs_edge.studies.speed.drawing import drawing
-from flexgs_edge.studies.speed.presets import presets
-from flexgs_edge.studies.speed.scoring import scoring
-from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
-from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_scene
+from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.study_scene import scene_names
+from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 
 LOG = logging.getLogger("flexgs_edge")
 
-PARTS = ("drawing", "scoring", "presets")
-REPEATS = 5
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "max"))
+"""Method and effort of each run."""
 
 
 class SpeedStudy(WrittenStudy):
@@ -39,58 +36,121 @@ def study_speed(
     output: str | Path,
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
-    parts: Sequence[str] = PARTS,
-    repeats: int = REPEATS,
     **words: Any,
 ) -> SpeedStudy:
-    """Measure speed against accuracy on a scene and write it to a folder.
+    """Measure the time and the ratio of every preset on a scene and write them to a folder.
 
-    Raises
-    ------
-    FlexGSError
-        `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is written then.
+    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
+    written then.
     """
     options = replace(options or CompressOptions(), **words)
-    _check(parts, repeats)
-    # Matplotlib is loaded before the memory is planned, so that its bytes count as taken.
-    require_matplotlib()
-    check_folder(output, options.force)
-    with atomic_folder(output, options.force) as folder:
-        (name,) = scene_names([scene])
-        with open_study_scene(scene, name, replace(options, method="paper"), progress) as studied:
-            found = SceneStudy.of(studied, _on_bench(studied, parts, repeats))
-        if "presets" in parts:
-            # These runs need the memory of the scene above, which is free by now.
-            found = replace(found, experiments=(*found.experiments, presets(scene, options, progress)))
-        page = study_page("Speed and accuracy", _INTRO, [write_scene(folder, found)])
-        (folder / "index.html").write_text(page, encoding="utf-8")
-    LOG.info("wrote %s", Path(output) / "index.html")
+    found = write_study(
+        output, options.force, "Speed and accuracy", _INTRO, lambda folder: _study(scene, options, progress)
+    )
     return SpeedStudy(os.fspath(output), found)
 
 
 _INTRO = (
-    "The cost of less work: drawing views less exactly, scoring Gaussians from fewer views, and searching less. "
-    " The Pareto front joins points that no other point beats in time and accuracy. Times are wall times "
-    "of this run on the device named below. Everything but times, and the fronts that they decide, is equal in every run."
+    "What searching less costs. The Pareto front joins points that no other point beats in time and ratio. Times are wall "
+    "times of this run on the device named below. Everything but times, and the front that they decide, is equal in every run."
 )
 
 
-def _check(parts: Sequence[str], repeats: int) -> None:
-    unknown = [part for part in parts if part not in PARTS]
-    if unknown or not parts:
-        raise InputError(f"--parts {','.join(unknown or parts)}: expected one or more of {', '.join(PARTS)}")
-    if repeats < 1:
-        raise InputError(f"--repeats {repeats}: expected 1 or more")
+def _study(path: str | Path, options: CompressOptions, progress: Progress) -> SceneStudy:
+    """One dry run of `compress` for each preset, all with the same target."""
+    rows: list[dict[str, Cell]] = []
+    for method, effort in PRESETS:
+        LOG.info("compress --method %s --effort %s", method, effort)
+        words = replace(options, method=method, effort=effort, dry_run=True, best_effort=True, report=None)
+        found = compress(path, None, words, progress)
+        rows.append(_row(method, effort, found))
+    best = front([float(row["seconds"] or 0) for row in rows], [float(row["ratio"] or 0) for row in rows])
+    for row, on in zip(rows, best):
+        row["front"] = on
+    table = Table(
+        columns(
+            method="method",
+            effort="effort",
+            seconds="seconds",
+            search_seconds="of them, search",
+            steps="results measured",
+            size="bytes",
+            ratio="ratio to PLY",
+            kept="Gaussians kept",
+            drop="drop (dB)",
+            fidelity="fidelity (dB)",
+            modelled_drop="modelled drop (dB)",
+            reached="target met",
+            front="on the front",
+        ),
+        tuple(rows),
+    )
+    experiment = Experiment(
+        "presets",
+        "Time of a whole run and the ratio that it finds",
+        f"compress by each method and effort, asked for {found.target}: opening, scoring, searching, coding and measuring the "
+        "final quality. All run in one process, whose device is started and whose kernels are built before. Nothing is written.",
+        table,
+        LineChart(
+            "Time of a run against the ratio that it finds",
+            "seconds of the run (log)",
+            "ratio to the PLY",
+            tuple(
+                Series(
+                    method,
+                    table.values("seconds", method=method),
+                    table.values("ratio", method=method),
+                    notes=table.values("effort", method=method),
+                )
+                for method in dict.fromkeys(str(row["method"]) for row in rows)
+            ),
+            log_x=True,
+            front=[(float(row["seconds"] or 0), float(row["ratio"] or 0)) for row in rows if row["front"]],
+        ),
+        (
+            "; ".join(
+                f"{row['method']} {row['effort']}: {row['ratio']:.1f}x at {_loss(row)} in {row['seconds']:.1f} s"
+                for row in rows
+            )
+            + ".",
+        ),
+        timed=True,
+    )
+    assert found.views is not None
+    by = decided_words(found)
+    return SceneStudy(scene_names([path])[0], found.scene, found.views, by, (experiment,), found.run)
 
 
-def _on_bench(studied: StudyScene, parts: Sequence[str], repeats: int) -> list[Experiment]:
-    makers: dict[str, Callable[[], list[Experiment]]] = {
-        "drawing": lambda: [drawing(studied, repeats)],
-        "scoring": lambda: scoring(studied),
+def _row(method: str, effort: str, found: CompressResult) -> dict[str, Cell]:
+    quality = found.quality
+    assert quality is not None
+    drop, fidelity = quality.drop, quality.fidelity
+    return {
+        "method": method,
+        "effort": effort,
+        "seconds": round(found.run.seconds - found.run.startup_seconds, 2),
+        "search_seconds": round(found.run.stages.get("search", 0.0), 2),
+        "steps": 0 if found.search is None else len(found.search.steps),
+        "size": found.size,
+        "ratio": round(found.ratio, 3),
+        "kept": found.count,
+        "drop": None if drop is None else round(drop, 4),
+        "fidelity": None if fidelity is None else round(fidelity, 4),
+        "modelled_drop": round(quality.modelled_drop, 4),
+        "reached": found.reached,
     }
-    made: list[Experiment] = []
-    for part, make in makers.items():
-        if part in parts:
-            LOG.info("%s: %s", studied.name, part)
-            made += make()
-    return made
+
+
+def _loss(row: dict[str, Cell]) -> str:
+    name = "modelled_drop" if row["drop"] is None else "drop"
+    return f"{float(row[name] or 0.0):.3f} dB"
+
+
+def front(costs: Sequence[float], worths: Sequence[float]) -> list[bool]:
+    """For each point, whether it is on the front: no other, different point costs at most as much and is worth at least as much.
+
+    >>> front([1.0, 2.0, 3.0, 3.0], [5.0, 4.0, 6.0, 6.0])
+    [True, False, True, True]
+    """
+    points = list(zip(costs, worths))
+    return [not any(c <= cost and w >= worth and (c, w) != (cost, worth) for c, w in points) for cost, worth in points]

@@ -16,11 +16,20 @@ from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
-from flexgs_edge.studies.stability.amounts import Amounts
-from flexgs_edge.studies.stability.breaks import BREAK, LOST, mean_loss, number, view_loss
-from flexgs_edge.studies.stability.contenders import BEST, MARGIN, WORDS, Contenders
-from flexgs_edge.studies.stability.ours import Whole, search
-from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, worst_tile
+from flexgs_edge.studies.stability.ours import (
+    BEST,
+    BREAK,
+    LOST,
+    MARGIN,
+    WORDS,
+    Contenders,
+    Whole,
+    mean_loss,
+    number,
+    search,
+    view_loss,
+)
+from flexgs_edge.studies.stability.unseen_poses import TILE_SIDE, Amounts, worst_tile
 from flexgs_edge.studies.study_scene import StudyScene
 
 EVEN, HELD = "best, decided on even views", "best, --max-worst-drop"

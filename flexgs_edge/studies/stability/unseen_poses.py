@@ -15,15 +15,12 @@ from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
-from flexgs_edge.studies.stability.amounts import Amounts
-from flexgs_edge.studies.stability.breaks import BREAK, LOST, curve, number
-from flexgs_edge.studies.stability.contenders import BEST, WORDS, Contenders
+from flexgs_edge.studies.stability.ours import BEST, BREAK, LOST, WORDS, Contenders, curve, number
 from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths
 
 TILE_SIDE = 64
-TURNS = (15.0, 30.0)
-"""Degrees by which a pose is turned up about the point that it looks at."""
+TURNS = (15.0, 30.0)  # Degrees by which a pose is turned up about the point that it looks at
 ZOOMS = (0.5, 2.0, 4.0)
 SIZES = (0.5, 2.0)
 TRAINING, HELD_OUT, DISTANCE = "training", "held out", "distance"
@@ -38,6 +35,21 @@ HEADS = {
     "below": "below its training poses (dB)",
     "broke": "broken by",
 }
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """The points of every experiment."""
+
+    width: int | None = None  # Most pixels that views are wide. None (default): as `--resolution` says.
+    # Factors on the distance from a camera to the scene.
+    distances: tuple[float, ...] = (0.25, 0.5, 0.71, 1.0, 1.41, 2.0, 4.0)
+    poses: int = 4  # how many held-out views other poses are made from
+    even: bool = True  # also let the even held-out views decide, and judge on the odd ones
+
+
+FULL = Amounts()
+QUICK = Amounts(width=120, distances=(0.5, 1.0, 2.0), poses=2, even=False)  # A quick look at every experiment
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
-from flexgs_edge.codec.v2.container import GridContainer, coded_size, write_grid
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.container import GridContainer, coded_size, decode_chunk, write_grid
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.device.launch import INFO, Device

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.codec.v2 import fit_groups
-from flexgs_edge.codec.v2.decode import decode_chunk
+from flexgs_edge.codec.v2.container import decode_chunk
 from flexgs_edge.codec.v2.encode import cells_of, chunk_codes, encode_grid
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.octree import TooManyNodes

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.codec.v2 import rans
-from flexgs_edge.codec.v2.fit_levels import cheapest_path, fit_levels
+from flexgs_edge.codec.v2.encode import cheapest_path, fit_levels
 from flexgs_edge.codec.v2.rans import Decoder, Encoder, StreamError, Tables, lane_count, normalize
 from flexgs_edge.codec.v2.tables import LEVELS, decode_tables, encode_tables, from_levels, merge_contexts, to_levels
 from flexgs_edge.constants import RANS_TOTAL as TOTAL

@@ -12,8 +12,8 @@ import pytest
 from flexgs_edge.goals.promise import MeanSsim, Promised
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.methods.best.descents import FIT_DESCENTS, LEAST_FIT, MOST_FIT, fits, rate_from
 from flexgs_edge.methods.best.effort import Effort
+from flexgs_edge.methods.best.grid_maker import FIT_DESCENTS, LEAST_FIT, MOST_FIT, fits, rate_from
 from flexgs_edge.methods.best.refit.distil import Schedule
 from flexgs_edge.methods.best.search import search
 from flexgs_edge.methods.best.selection import ALL_LEFT

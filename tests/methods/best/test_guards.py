@@ -15,13 +15,11 @@ from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.goals.choice import Choice
 from flexgs_edge.goals.promise import Promised, WorstView
-from flexgs_edge.goals.steps import Scored
+from flexgs_edge.goals.steps import Choice, Scored
 from flexgs_edge.goals.target import MaxDrop, Measurement, MinFidelity
 from flexgs_edge.memory.process import current_rss
-from flexgs_edge.methods.best.margin import FARTHER, NEARER, margin_of
-from flexgs_edge.methods.best.poses import is_fine
+from flexgs_edge.methods.best.poses import FARTHER, NEARER, is_fine, margin_of
 from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality

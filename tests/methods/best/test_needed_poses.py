@@ -16,8 +16,7 @@ from flexgs_edge.goals.promise import MeanSsim, Promised, WorstView, lost_views
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.memory.process import current_rss
 from flexgs_edge.methods.best.effort import LARGEST_STEP
-from flexgs_edge.methods.best.needed_poses import BESIDE, MOST_TIMES, needed_poses, poses_beside
-from flexgs_edge.methods.best.poses import scored_poses
+from flexgs_edge.methods.best.poses import BESIDE, MOST_TIMES, needed_poses, poses_beside, scored_poses
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from kernel_fixtures import large_budget, open_form

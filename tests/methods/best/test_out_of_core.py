@@ -20,9 +20,8 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best import effort, grid_maker
 from flexgs_edge.methods.best import method as best_method
-from flexgs_edge.methods.best.descents import INTERLEAVED_SHARE
 from flexgs_edge.methods.best.effort import EFFORTS
-from flexgs_edge.methods.best.grid_maker import GridMaker
+from flexgs_edge.methods.best.grid_maker import INTERLEAVED_SHARE, GridMaker
 from flexgs_edge.methods.best.refit.distil import Schedule
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.original import Original
@@ -119,8 +118,8 @@ def test_descents_between_the_rounds_are_not_done_again(
     steps = 100
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
     monkeypatch.setitem(EFFORTS, "max", replace(EFFORTS["max"], interleaved=3))
-    monkeypatch.setattr("flexgs_edge.methods.best.descents.INTERLEAVE_TO", 99.0)
-    monkeypatch.setattr("flexgs_edge.methods.best.descents.MOST_LEFT", 99.0)
+    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVE_TO", 99.0)
+    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.MOST_LEFT", 99.0)
     words: dict[str, Any] = {**TINY, "effort": "max"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
+from flexgs_edge.methods.best.costs import Snapshot
 from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds
-from flexgs_edge.methods.best.snapshot import Snapshot
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.bench import Bench

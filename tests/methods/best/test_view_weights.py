@@ -5,15 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexgs_edge.methods.best.view_weights import (
-    POWER,
-    RARE_POWER,
-    STEP,
-    KnownErrors,
-    base_errors,
-    rareness,
-    view_weights,
-)
+from flexgs_edge.methods.best.poses import POWER, RARE_POWER, STEP, KnownErrors, base_errors, rareness, view_weights
 from flexgs_edge.render.renderer import Renderer
 from kernel_fixtures import draw, large_budget, open_form
 from synthetic import look_from, make_camera, random_scene

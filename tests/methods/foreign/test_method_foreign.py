@@ -174,16 +174,7 @@ def test_on_the_command_line(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = str(project / "point_cloud.ply")
-    command = [
-        "compress",
-        scene,
-        "-o",
-        str(tmp_path / "a.spz"),
-        "--min-fidelity",
-        "150",
-        "--effort",
-        "fast",
-    ]
+    command = ["compress", scene, "-o", str(tmp_path / "a.spz"), "--min-fidelity", "150", "--effort", "fast"]
     with pytest.raises(SystemExit) as caught:
         app.main([*command, "-q", "--holdout", "4"])
     assert caught.value.code == 3 and "the closest point has fidelity" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.choice import Choice
+from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
 from quantized_scenes import make_scene
 

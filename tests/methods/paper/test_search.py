@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.goals.choice import Choice
-from flexgs_edge.goals.steps import REFINE_STEPS
+from flexgs_edge.goals.steps import REFINE_STEPS, Choice
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, min_ratio
-from flexgs_edge.methods.paper.loss_model import LossModel
-from flexgs_edge.methods.paper.search import CANDIDATES, GRID, REACH, adapt, measure_fixed
+from flexgs_edge.methods.paper.search import CANDIDATES, GRID, REACH, LossModel, adapt, measure_fixed
 
 COUNT = 100_000
 

@@ -47,19 +47,9 @@ class RowSteps:
 class ChunkKernel:
     """Decodes several chunks of a file at once, one work-item each.
 
-    Parameters
-    ----------
-    device : Device
-        A backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take far too
-        long.
-    model : Model
-        The model of the file.
-    rows : int
-        Rows of the largest chunk.
-    data_bytes : int
-        Bytes of the longest chunk.
-    chunks : int
-        Number of chunks decoded at once.
+    `device`: a backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take
+    far too long. `model`: the model of the file. `rows`: rows of the largest chunk. `data_bytes`: bytes of the longest
+    chunk. `chunks`: number of chunks decoded at once.
     """
 
     def __init__(self, device: Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
@@ -218,10 +208,8 @@ def _out_planes(sh_degree: int) -> int:
 def pack_model(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pack a model for the kernel.
 
-    Returns
-    -------
-    tuple of np.ndarray
-        [alphabets, 203] i32 records; [tables, 2^14] u8, the symbol of every slot; [symbols of all tables] u32 entries.
+    Returns [alphabets, 203] i32 records; [tables, 2^14] u8, the symbol of every slot; [symbols of all tables] u32
+    entries.
     """
     records = np.zeros((len(model.tables), RECORD), np.int32)
     tables_before = entries_before = 0

@@ -31,18 +31,8 @@ def device_bytes(rows: int, sh_degree: int) -> int:
 class CountKernel:
     """Counts the symbols of several chunks at once, one work-item each; NumPy counts those of positions.
 
-    Parameters
-    ----------
-    device : Device
-        A backend whose work-items run as threads of a processor.
-    groups : list of Group
-        The groups of the model.
-    sh_degree : int
-        SH degree of the scene.
-    rows : int
-        Rows of the largest chunk.
-    chunks : int
-        Number of chunks counted at once.
+    `device`: a backend whose work-items run as threads of a processor. `groups`: the groups of the model. `sh_degree`:
+    SH degree of the scene. `rows`: rows of the largest chunk. `chunks`: number of chunks counted at once.
     """
 
     def __init__(self, device: Device, groups: list[Group], sh_degree: int, rows: int, chunks: int) -> None:

@@ -9,8 +9,7 @@ import numpy as np
 
 from flexgs_edge.codec.v2.groups import Group
 
-_SPARE = 96
-"""Elements of each plane beyond its rows: vectors may load and store there."""
+_SPARE = 96  # Elements of each plane beyond its rows: vectors may load and store there
 # Fields of a chunk's info record, for input and result; the kernel has the same order.
 INFO = ("rows", "lanes", "words", "status", "found", "found high", "wanted", "at")
 # Places in the record of an alphabet; the kernel has the same.
@@ -28,8 +27,7 @@ PLACES = {
     "tables": 200,
     "counts": 202,
 }
-RECORD = 203
-"""Length of a record in i32."""
+RECORD = 203  # Length of a record in i32
 PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
 """Work planes of a chunk: number and type of each."""
 
@@ -56,21 +54,14 @@ class Device(Protocol):
 def launch_coding(
     device: Device,
     chunks: int,
-    shape: tuple[int, int, int],
-    shared: Sequence[Any],
+    shape: tuple[int, int, int],  # elements of a plane, number of code planes, SH degree
+    shared: Sequence[Any],  # arguments for both directions, in the kernel's order
     decoding: tuple[Sequence[int], Sequence[Any]] | None = None,
     counting: tuple[Sequence[int], Sequence[Any]] | None = None,
 ) -> None:
     """Run `code_chunks`, either to decode or to count.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Elements of a plane, number of code planes, SH degree.
-    shared : sequence of arrays
-        Arguments for both directions, in the kernel's order.
-    decoding, counting : tuple, optional
-        Numbers and arrays for the one direction to run.
+    `decoding`, `counting`: numbers and arrays for the one direction to run.
     """
     # The kernel does not touch the arrays of the other direction, so any array may stand there.
     numbers, arrays = decoding or ([0] * 3, [shared[0]] * 4)

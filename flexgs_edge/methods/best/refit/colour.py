@@ -22,8 +22,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
-ROUND_VIEWS = 96
-"""Least poses of a round: docs/results/tuning.md#round_views"""
+ROUND_VIEWS = 96  # Least poses of a round: docs/results/tuning.md#round_views
 RELAX_DC = 1.0
 RELAX_SH = 0.25
 """Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
@@ -32,11 +31,11 @@ diverge: docs/results/tuning.md#relax_sh"""
 
 
 def refit_colours(
-    planes: dict[str, np.ndarray],
-    degrees: np.ndarray,
-    original: Original,
+    planes: dict[str, np.ndarray],  # stored planes of the kept Gaussians ([width, n] f32 by field); not changed
+    degrees: np.ndarray,  # [n] u8, SH degree kept for each row. Coefficients above it stay zero.
+    original: Original,  # the scored poses and the original's renders
     rounds: int,
-    bands: bool = True,
+    bands: bool = True,  # Refit the SH above degree 0 too (default). Otherwise only the constant moves.
     subsets: int = 1,
 ) -> dict[str, np.ndarray]:
     """Move colours towards the original's renders, all at once, for a fixed number of rounds.
@@ -44,26 +43,10 @@ def refit_colours(
     Each step adds `relax * sum(Y alpha T r) / sum(|Y| alpha T)` to every coefficient (SIRT: Gilbert 1972). Sums are over
     pixels and poses, and r is the original's render minus the present one. Gaussians that no pose sees stay as they are.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
-    degrees : np.ndarray
-        [n] u8, SH degree kept for each row. Coefficients above it stay zero.
-    original : Original
-        The scored poses and the original's renders.
-    rounds : int
-        How often we look at every pose. Each round takes about as long as rendering all poses. With many poses, each round
-        looks at an interleaved set of them: as many sets as have `ROUND_VIEWS` each.
-    bands : bool
-        Refit the SH above degree 0 too (default). Otherwise only the constant moves.
-    subsets : int
-        Steps of a round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1.
-
-    Returns
-    -------
-    dict
-        The planes, with new arrays of what has moved.
+    `rounds`: how often we look at every pose. Each round takes about as long as rendering all poses. With many poses,
+    each round looks at an interleaved set of them: as many sets as have `ROUND_VIEWS` each. `subsets`: steps of a
+    round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1. Returns the
+    planes, with new arrays of what has moved.
     """
     bench, cameras = original.bench, original.cameras
     renderer, storage = bench.renderer, bench.renderer.storage
@@ -140,18 +123,9 @@ def step_colours(
 ) -> None:
     """Take one step of the refit for some rows, in place.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes ([width, n] f32 by field); colours of `rows` change.
-    degrees : np.ndarray
-        [n] u8, SH degrees of all rows.
-    rows : slice
-        The rows to change.
-    normal : np.ndarray
-        [K + 1, 4, rows] f32, their sums (`normal_sums`). Without `bands` those of the constant are enough.
-    bands : bool
-        Change the SH above degree 0 too.
+    `planes`: stored planes ([width, n] f32 by field); colours of `rows` change. `degrees`: [n] u8, SH degrees of all
+    rows. `rows`: the rows to change. `normal`: [K + 1, 4, rows] f32, their sums (`normal_sums`). Without `bands` those
+    of the constant are enough. `bands`: change the SH above degree 0 too.
     """
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -9,17 +11,198 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import LANES
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.refit.chunk_state import PLANE_SETS, ChunkState, fields_of, widths
-from flexgs_edge.methods.best.refit.prices import PRICES
+from flexgs_edge.grid.step_sizes import Planes, StepSizes
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.memory.rows import read_ahead
 from flexgs_edge.render.chunks import Chunk
 from flexgs_edge.render.fit import GRADIENT_SUMS, sum_bytes
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib
 
-GRID_VALUES = 14
-"""Step sizes that the kernel `snap` takes."""
+PRICES = 33  # Values of the record that the kernel `descend` takes
+WIDTH = 0.5
+"""Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
+
+
+def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: float) -> np.ndarray:
+    """The record of the kernel `descend`.
+
+    `planes`: {field: [width, n] f32}, with n above 0, before the descent. Quaternions have their canonical form.
+    `degrees`: [n] u8, SH degree kept for each row. `steps`: of the grid that the values will be put on. `worth`:
+    squared error in one pose that a bit costs. Returns [33] f32: price and width of scale, rotation and opacity, and of
+    luma and chroma of the constant and each SH degree; then centres of the three scales, opacity, Y, Co and Cg.
+    """
+    centres = _centres(planes)
+    grid = [steps.scale, steps.rotation, steps.opacity]
+    for luma in (steps.dc, *steps.sh):
+        grid += [float(size) for size in steps.colour(luma)[:2]]
+    sums, counts = np.zeros(len(grid)), np.zeros(len(grid))
+    fields = (planes[name] for name in ("log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest"))
+    for rows, (scales, quats, logits, constant, rest) in read_ahead(len(degrees), *fields):
+        colours, own = _luma_and_chroma(constant) - centres[4:, None], degrees[rows]
+        kinds = [scales - centres[:3, None], quats[1:], logits - centres[3], colours[:1], colours[1:]]
+        bands = rest.reshape(3, -1, len(own))
+        for level in range(1, len(steps.sh) + 1):
+            band = _luma_and_chroma(bands[:, level * level - 1 : (level + 1) ** 2 - 1, own >= level])
+            kinds += [band[:1], band[1:]]
+        sums += [np.abs(away).sum(dtype=np.float64) for away in kinds]
+        counts += [away.size for away in kinds]
+    # Where all values are alike they take no bits, and a small b must not make a large price of it.
+    spreads = np.maximum(sums / np.maximum(counts, 1), np.array(grid) / 4)
+    prices = np.zeros(PRICES, np.float32)
+    prices[0 : 2 * len(grid) : 2] = worth / (math.log(2) * spreads)
+    prices[1 : 2 * len(grid) : 2] = WIDTH * np.array(grid)
+    prices[-len(centres) :] = centres
+    return prices
+
+
+def _centres(planes: Planes) -> np.ndarray:
+    """[7] f64, medians of the three scales, opacity, Y, Co and Cg. Memory holds one column at a time."""
+
+    def median(name: str, place: int) -> float:
+        column = np.empty(planes[name].shape[1])
+        for rows, (part,) in read_ahead(len(column), planes[name]):
+            column[rows] = (_luma_and_chroma(part) if name == "sh_dc" else part)[place]
+        return float(np.median(column, overwrite_input=True))
+
+    scales, colours = ([median(name, place) for place in range(3)] for name in ("log_scales", "sh_dc"))
+    return np.array([*scales, median("opacity_logits", 0), *colours])
+
+
+def _luma_and_chroma(colours: np.ndarray) -> np.ndarray:
+    """Y, Co and Cg ([3, ...] f64) of red, green and blue."""
+    red, green, blue = colours.astype(np.float64)
+    return np.stack([(red + 2 * green + blue) / 4, red - blue, green - (red + blue) / 2])
+
+
+ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+"""Fields in the order of a gradient's planes (cl_kernels/values.clh)."""
+DECAYS = (0.9, 0.99)
+"""Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
+a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
+WIDE = 0.055
+"""A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
+steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
+PLANE_SETS = 5  # How often all planes of a chunk are held: values and their mean, gradient, two running means of it
+
+
+def widths(sh_degree: int) -> dict[str, int]:
+    """How many planes each field has, in the order of `ORDER`."""
+    return {name: FIELD[name].width(sh_degree) for name in ORDER}
+
+
+class ChunkState:
+    """Values of a chunk's rows, their mean, the last gradient, and Adam's running means of gradients.
+
+    `chunk`: gets the values that views are drawn from. `antialiased`: as in `DeviceScene`.
+    """
+
+    def __init__(self, backend: Backend, chunk: Chunk, antialiased: bool) -> None:
+        self.backend, self.chunk, self.antialiased = backend, chunk, int(antialiased)
+        self.widths, self._arrays = widths(chunk.degree), []  # type: dict[str, int], list[Any]
+        stride, self.planes = chunk.stride, sum(self.widths.values())
+        try:
+            self.values, self.gradient, self.first, self.second, self.mean = (
+                self._array((self.planes, stride)) for _ in range(PLANE_SETS)
+            )
+            self.powers, self.pace = self._array((2, stride)), self._array((stride,))
+            self.degrees = self._array((stride,), np.uint32)
+            self.stored = [self._array((width, stride)) for width in (3, 4, 1)]
+        except BaseException:
+            self.release()
+            raise
+
+    def _array(self, shape: tuple[int, ...], dtype: Any = np.float32) -> Any:
+        self._arrays.append(self.backend.array(shape, dtype))
+        return self._arrays[-1]
+
+    def begin(self) -> None:
+        """Forget all steps so far."""
+        for array in (self.first, self.second, self.mean):
+            self.backend.fill(array, 0)
+        self.backend.write(self.powers, np.ones(self.powers.shape, np.float32))
+
+    def put_degrees(self, degrees: np.ndarray) -> None:
+        """Set the SH degrees of the rows ([count] u8)."""
+        own = np.zeros(self.chunk.stride, np.uint32)
+        own[: self.chunk.count] = degrees
+        self.backend.write(self.degrees, own)
+
+    def snap(self, steps: Any) -> None:
+        """Put the values on a grid (record of `step_record`), for drawing."""
+        chunk, stride = self.chunk, self.chunk.stride
+        self.backend.launch(
+            "snap",
+            (stride,),
+            stride,
+            chunk.degree,
+            steps,
+            self.values,
+            chunk.means,
+            *self.stored,
+            chunk.sh_dc,
+            chunk.sh_rest,
+        )
+
+    def activate(self) -> None:
+        """Compute what else views are drawn from, after `snap`."""
+        stride, chunk = self.chunk.stride, self.chunk
+        self.backend.launch(
+            "activate", (stride,), stride, self.antialiased, *self.stored, chunk.cov, chunk.log2_opacity
+        )
+
+    def differentiate(self, camera: Any, records: Any, sums: Any, base: int) -> None:
+        """Gradients of the rows from a view's splats and their sums, where the chunk's first row is at `base`."""
+        chunk = self.chunk
+        self.backend.launch(
+            "project_backward", (chunk.stride,), chunk.count, chunk.stride, base, chunk.degree, self.antialiased, WIDE,
+            camera, chunk.means, *self.stored, chunk.sh_rest, self.degrees, records, sums, self.pace, self.gradient,
+        )  # fmt: skip
+
+    def step(self, rates: Any, steps: Any, prices: Any | None = None, share: float = 0.0) -> None:
+        """Take one step of Adam, and put the values on a grid for drawing (records of `rate_record` and `step_record`).
+
+        With `prices` (record of `bit_prices`), gradients count what bits cost. With a `share`, the mean follows.
+        """
+        chunk, stride = self.chunk, self.chunk.stride
+        self.backend.launch(
+            "descend", (stride,), stride, chunk.degree, self.planes, self.antialiased, int(prices is not None), int(share > 0),
+            *DECAYS, share, rates, rates if prices is None else prices, steps, self.degrees, self.pace, self.gradient,
+            self.powers, self.first, self.second, self.values, self.mean, chunk.means, *self.stored, chunk.sh_dc, chunk.sh_rest,
+            chunk.cov, chunk.log2_opacity,
+        )  # fmt: skip
+
+    def follow(self, share: float) -> None:
+        """Move the mean towards the values by `share`."""
+        stride = self.chunk.stride
+        self.backend.launch("follow", (stride,), stride, self.planes, share, self.values, self.mean)
+
+    def settle(self) -> None:
+        """Take the mean as the values."""
+        stride = self.chunk.stride
+        self.backend.launch("follow", (stride,), stride, self.planes, 1.0, self.mean, self.values)
+
+    def release(self) -> None:
+        """Free everything but the chunk."""
+        for array in self._arrays:
+            array.release()
+        self._arrays = []
+
+
+def fields_of(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tuple[str, slice, np.ndarray]]:
+    """Name, slice among all planes, and values of each field, as views. SH are cut to the first coefficients of each channel."""
+    at = 0
+    for name, width in own.items():
+        values = planes[name]
+        if name == "sh_rest":
+            values = values.reshape(3, len(values) // 3, values.shape[1])[:, : width // 3]
+        yield name, slice(at, at + width), values
+        at += width
+
+
+GRID_VALUES = 14  # Step sizes that the kernel `snap` takes
 
 
 def descent_bytes(sh_degree: int) -> int:
@@ -37,35 +220,18 @@ class Descent:
     After `put_on`, views are drawn from values rounded to their grids, but gradients move the values themselves (the
     straight-through rule). Neighbours then compensate for errors of rounding, too.
 
-    Parameters
-    ----------
-    renderer : Renderer
-        With nothing loaded.
-    planes : dict
-        Stored planes ([width, n] f32 by field); not changed.
-    degrees : np.ndarray
-        [n] u8, SH degree of each row. Coefficients above it stay as they are.
-    origin : np.ndarray
-        [3] f64, as in `SceneSource`.
-    camera : Camera
-        The largest view, from which memory is planned.
-    structure : float
-        Weight of the structural term of the loss (`Renderer.gradient_sums`).
-
-    Raises
-    ------
-    BudgetError
-        When the scene, its gradients and their running means do not fit at once. `StreamedDescent` goes on there.
+    Raises `BudgetError` when the scene, its gradients and their running means do not fit at once. `StreamedDescent`
+    goes on there.
     """
 
     def __init__(
         self,
-        renderer: Renderer,
-        planes: dict[str, np.ndarray],
-        degrees: np.ndarray,
-        origin: np.ndarray,
-        camera: Camera,
-        structure: float = 0.0,
+        renderer: Renderer,  # with nothing loaded
+        planes: dict[str, np.ndarray],  # stored planes ([width, n] f32 by field); not changed
+        degrees: np.ndarray,  # [n] u8, SH degree of each row. Coefficients above it stay as they are.
+        origin: np.ndarray,  # [3] f64, as in `SceneSource`
+        camera: Camera,  # the largest view, from which memory is planned
+        structure: float = 0.0,  # weight of the structural term of the loss (`Renderer.gradient_sums`)
     ) -> None:
         self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)

@@ -14,18 +14,12 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.refit.prices import bit_prices
+from flexgs_edge.methods.best.refit.descent import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
 from flexgs_edge.views.original import Original
 
-FIELD_RATES = {
-    "log_scales": 4e-2,
-    "quats": 4.8e-3,
-    "opacity_logits": 8e-2,
-    "sh_dc": 8e-3,
-    "sh_rest": 1e-3,
-}
+FIELD_RATES = {"log_scales": 4e-2, "quats": 4.8e-3, "opacity_logits": 8e-2, "sh_dc": 8e-3, "sh_rest": 1e-3}
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
 STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
@@ -47,20 +41,13 @@ class Course:
     """Numbers of a descent that depend on how often it looks at every pose.
 
     They are chosen in docs/results/tuning.md#together.
-
-    Parameters
-    ----------
-    means_rate : float
-        Largest change of a position in a step, as a share of the cameras' extent. With more, positions shake.
-    mean_views : float
-        Values on their grids are averaged over this many steps for each view.
-    bit_weight : float
-        Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only those
-        that are shown: docs/results/tuning.md#bit_weight
     """
 
+    # Largest change of a position in a step, as a share of the cameras' extent. With more, positions shake.
     means_rate: float
-    mean_views: float
+    mean_views: float  # values on their grids are averaged over this many steps for each view
+    # Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only
+    # those that are shown: docs/results/tuning.md#bit_weight
     bit_weight: float
 
 
@@ -72,29 +59,18 @@ SHORT, LONG = Course(0.7e-4, 0.25, 5.0), Course(1.0e-4, 0.5, 3.3)
 class Schedule:
     """Length and course of a descent.
 
-    Parameters
-    ----------
-    iterations : int
-        How many views it looks at, one a step.
-    rate : float
-        Factor on all rates.
-    last : float
-        Rates at the end as a share of those at the beginning.
-    on_grid, holding : float
-        Share of the steps before values are put on their grids for drawing, and share before geometry is held there.
-    multiplier : float
-        Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
-    course : Course
-        See there.
+    `on_grid`, `holding`: share of the steps before values are put on their grids for drawing, and share before geometry
+    is held there.
     """
 
-    iterations: int
-    rate: float = 1.0
-    last: float = LAST
+    iterations: int  # how many views it looks at, one a step
+    rate: float = 1.0  # factor on all rates
+    last: float = LAST  # rates at the end as a share of those at the beginning
     on_grid: float = ON_GRID
     holding: float = HOLDING
+    # Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
     multiplier: float = 0.0
-    course: Course = LONG
+    course: Course = LONG  # see there
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
         """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
@@ -139,42 +115,20 @@ def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
 
 
 def distil(
-    planes: dict[str, np.ndarray],
-    degrees: np.ndarray,
+    planes: dict[str, np.ndarray],  # stored planes of the kept Gaussians ([width, n] f32 by field); not changed
+    degrees: np.ndarray,  # [n] u8, SH degree kept for each row. Coefficients above it stay zero.
     original: Original,
-    schedule: Schedule,
+    schedule: Schedule,  # number of steps, and when the grid comes in
     step_sizes: StepSizes | None = None,
-    rates: dict[str, float] | None = None,
-    structure: float = STRUCTURE,
+    rates: dict[str, float] | None = None,  # rates by field, in place of those of `rates_for`
+    structure: float = STRUCTURE,  # weight of 1 - SSIM in the loss, beside the squared error
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
 
-    Parameters
-    ----------
-    planes : dict
-        Stored planes of the kept Gaussians ([width, n] f32 by field); not changed.
-    degrees : np.ndarray
-        [n] u8, SH degree kept for each row. Coefficients above it stay zero.
-    original : Original
-        The scored poses and those between them, with the original's renders. Its renderer has nothing loaded.
-    schedule : Schedule
-        Number of steps, and when the grid comes in.
-    step_sizes : StepSizes, optional
-        Of the grid that the values will be put on. The last steps then compensate for its rounding.
-    rates : dict, optional
-        Rates by field, in place of those of `rates_for`.
-    structure : float
-        Weight of 1 - SSIM in the loss, beside the squared error.
-
-    Returns
-    -------
-    dict
-        The values ([width, n] f32 by field), not rounded to any grid, in the renderer's storage.
-
-    Raises
-    ------
-    BudgetError
-        When the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
+    `original`: the scored poses and those between them, with the original's renders. Its renderer has nothing loaded.
+    `step_sizes`: of the grid that the values will be put on. The last steps then compensate for its rounding. Returns
+    the values ([width, n] f32 by field), not rounded to any grid, in the renderer's storage. Raises `BudgetError` when
+    the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
     """
     cameras, course = original.poses, schedule.course
     rates = {**rates_for(cameras, course.means_rate), **(rates or {})}
