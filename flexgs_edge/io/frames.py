@@ -14,7 +14,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.source import Planes, Rows, SceneSource
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
 
 _POSITIVE = "RDF"
 _NEGATIVE = "LUB"
@@ -62,14 +62,12 @@ RUB = Frame("RUB")  # x right, y up, z back: the frame of OpenGL, three.js and `
 LUF = Frame("LUF")  # x left, y up, z forward: the frame of glTF
 
 
-class FrameSource(SceneSource):
+class FrameSource(WrappedSource):
     """A scene with its axes turned from RDF into `frame`, or from `frame` into RDF: both are the same change of signs."""
 
     def __init__(self, parent: SceneSource, frame: Frame) -> None:
-        self.parent, self.frame = parent, frame
-        self.name, self.count, self.sh_degree = parent.name, parent.count, parent.sh_degree
-        self.sh_count, self.notes, self.valid = parent.sh_count, parent.notes, parent.valid
-        self.settings, self.held_bytes = parent.settings, parent.held_bytes
+        super().__init__(parent)
+        self.frame = frame
         self.origin = parent.origin * frame.signs + 0.0  # no -0.0, which would show in files and messages
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:

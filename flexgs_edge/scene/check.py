@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
-from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource, WrappedSource
 
 LOG = logging.getLogger("flexgs_edge")
 TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
@@ -125,17 +125,12 @@ def _check_chunk(source: SceneSource, rows: slice, faults: _Faults) -> tuple[np.
     return bad, infinite
 
 
-class _FiniteSource(SceneSource):
+class _FiniteSource(WrappedSource):
     """A checked source whose infinite values are read as finite ones: log-scales of at least `floor`, and bounded logits."""
 
-    valid = True
-
     def __init__(self, parent: SceneSource, floor: np.float32, notes: tuple[str, ...]) -> None:
-        self.parent, self.floor = parent, np.float32(floor)
-        self.name, self.count, self.sh_degree = parent.name, parent.count, parent.sh_degree
-        self.sh_count, self.origin, self.notes = parent.sh_count, parent.origin, (*parent.notes, *notes)
-        # Without the parent's comments: these values do not lie on the grid that they may name.
-        self.settings, self.held_bytes = parent.settings, parent.held_bytes
+        super().__init__(parent, notes)
+        self.floor, self.valid = np.float32(floor), True
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""

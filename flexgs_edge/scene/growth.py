@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.scene.source import Planes, Rows, SceneSource
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
 
 GROWTH_POWER = 0.125
 """Power by which scales grow with the number of rows that belong to a scene over those that are there:
@@ -19,15 +19,12 @@ def growth(there: int, whole: int) -> np.float32:
     return np.float32(GROWTH_POWER * math.log(whole / there))
 
 
-class GrownSource(SceneSource):
+class GrownSource(WrappedSource):
     """A part of a scene of `whole` rows, grown to stand for all of it."""
 
     def __init__(self, parent: SceneSource, whole: int) -> None:
-        self.parent, self._growth = parent, growth(max(parent.count, 1), whole)
-        self.name, self.origin, self.count = parent.name, parent.origin, parent.count
-        self.sh_degree, self.sh_count = parent.sh_degree, parent.sh_count
-        self.notes, self.settings, self.valid = parent.notes, parent.settings, parent.valid
-        self.held_bytes = parent.held_bytes
+        super().__init__(parent)
+        self._growth = growth(max(parent.count, 1), whole)
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""

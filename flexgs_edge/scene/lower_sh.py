@@ -7,19 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.source import Planes, Rows, SceneSource
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
 
 
-class TrimmedSource(SceneSource):
+class TrimmedSource(WrappedSource):
     """A scene with SH up to a lower degree, and without SH where `keeps_sh` ([N] bool) is false."""
 
     def __init__(self, parent: SceneSource, keeps_sh: np.ndarray, degree: int, notes: tuple[str, ...] = ()) -> None:
-        self.parent, self.keeps_sh = parent, keeps_sh
-        self.name, self.origin, self.count = parent.name, parent.origin, parent.count
-        self.notes, self.settings, self.valid = parent.notes + notes, parent.settings, parent.valid
-        self.sh_degree = min(degree, parent.sh_degree)
+        super().__init__(parent, notes)
+        self.keeps_sh, self.sh_degree = keeps_sh, min(degree, parent.sh_degree)
         self.sh_count = parent.sh_count if self.sh_degree else 0
-        self.held_bytes = parent.held_bytes
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""

@@ -226,7 +226,19 @@ class MemorySource(SceneSource):
         return planes
 
 
-class SelectSource(SceneSource):
+class WrappedSource(SceneSource):
+    """Another source with other values: a subclass changes what it does not share with its parent."""
+
+    def __init__(self, parent: SceneSource, notes: tuple[str, ...] = ()) -> None:
+        self.parent, self.notes = parent, (*parent.notes, *notes)
+        self.name, self.count, self.origin = parent.name, parent.count, parent.origin
+        self.sh_degree, self.sh_count, self.valid = parent.sh_degree, parent.sh_count, parent.valid
+        # Without comments: these values do not lie on the grid that they may name.
+        self.settings, self.held_bytes = parent.settings, parent.held_bytes
+        self.file_bytes, self.version = parent.file_bytes, parent.version
+
+
+class SelectSource(WrappedSource):
     """Some rows of another source, in the given order. A selection of a selection reads the first source.
 
     `parent`: the source of the values. `rows`: [n] integers in [0, parent.count), in any order, repeats allowed.
@@ -236,17 +248,13 @@ class SelectSource(SceneSource):
     def __init__(self, parent: SceneSource, rows: np.ndarray, notes: tuple[str, ...] = ()) -> None:
         plain, _ = normalize_rows(np.asarray(rows), parent.count)
         assert isinstance(plain, np.ndarray)
-        notes = parent.notes + notes
+        super().__init__(parent, notes)
         if isinstance(parent, SelectSource):
-            plain, parent = parent.rows[plain], parent.parent
-        sh_rows = np.flatnonzero(plain < parent.sh_count)
-        self.parent: SceneSource = parent
+            plain, self.parent = parent.rows[plain], parent.parent
         # int32 if it suffices, for half the bytes: the list lives as long as the source.
-        self.rows: np.ndarray = plain.astype(np.int32 if parent.count < 2**31 else np.int64)
-        self.name, self.count, self.sh_degree = parent.name, plain.size, parent.sh_degree
-        self.sh_count = int(sh_rows[-1]) + 1 if sh_rows.size else 0
-        self.origin, self.notes, self.valid = parent.origin, notes, parent.valid
-        self.settings, self.held_bytes = parent.settings, parent.held_bytes
+        self.rows: np.ndarray = plain.astype(np.int32 if self.parent.count < 2**31 else np.int64)
+        sh_rows = np.flatnonzero(plain < self.parent.sh_count)
+        self.count, self.sh_count = plain.size, int(sh_rows[-1]) + 1 if sh_rows.size else 0
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; if the rows are out of order, the values read are copied once more."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera, largest_of
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.errors import TargetError
@@ -26,19 +26,18 @@ from flexgs_edge.goals.target import Measurement
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
-from flexgs_edge.methods.best.effort import distil_steps, effort_of
+from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
-from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, is_fine, scored_poses
+from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
 from flexgs_edge.methods.best.selection import Measure
-from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES, choose_storage, least_spilled, needed_bytes
+from flexgs_edge.methods.best.spill import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
-from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.judges import Judges
@@ -241,24 +240,18 @@ def open_rounds(
     known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
 ) -> Iterator[PruneRounds]:
     """Open the rounds of pruning for one search, or for several that share them, the weakest compression first."""
-    renderer, source, options, budget = bench.renderer, run.source, run.options, run.budget
-    foreign, fine = run.output.format is not None, is_fine(options, source)
-    storage, steps = renderer.storage, distil_steps(options, len(scored), source.count, foreign, fine)
-    if storage.spills:
-        size, least = SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest_of(scored), steps > 0)
-    else:
-        view = view_size(renderer.backend, largest_of(scored))
-        size, least = needed_bytes(renderer.fit, view, source, len(scored), options, steps > 0)
-    budget.require("a search by measured costs", size + least)
-    budget.take("the scene and its search", size)
+    source, options, budget, storage = run.source, run.options, run.budget, bench.renderer.storage
+    plan = MemoryPlan.of(run, bench.renderer, scored)
+    budget.require("a search by measured costs", plan.held + plan.least)
+    budget.take("the scene and its search", plan.held)
     try:
         with References(storage.folder) as references:
             with run.clock.stage("search"):
-                between = poses_between(scored) if steps else ()
+                between = poses_between(scored) if plan.steps else ()
                 poses = [*scored, *between]
-                turns = known.slopes(poses) if known and steps else None
+                turns = known.slopes(poses) if known and plan.steps else None
                 rounds = PruneRounds(
-                    Original(bench, source.origin, scored, references, between, run.progress, steps, turns),
+                    Original(bench, source.origin, scored, references, between, run.progress, plan.steps, turns),
                     source,
                     refit=options.refit,
                     unseen_share=options.unseen_share,
@@ -266,7 +259,7 @@ def open_rounds(
                 )
             yield rounds
     finally:
-        budget.give(size)
+        budget.give(plan.held)
 
 
 def search_rounds(

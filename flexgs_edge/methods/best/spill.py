@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
+from flexgs_edge.methods.best.poses import is_fine
 from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
 from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row_bytes
@@ -79,6 +81,26 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
     return min(held, READING_BYTES + SPILLED_ROW_BYTES * source.count + view)
 
 
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What a search takes of memory."""
+
+    steps: int  # of the descent to a candidate; 0 for none
+    held: int  # bytes of the scene and its search
+    least: int  # least bytes that drawing needs beside them
+
+    @classmethod
+    def of(cls, run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera]) -> MemoryPlan:
+        """The plan of a search with these scored poses, where the renderer's storage is."""
+        source, options, largest = run.source, run.options, largest_of(scored)
+        foreign, fine = run.output.format is not None, is_fine(options, source)
+        steps = distil_steps(options, len(scored), source.count, foreign, fine)
+        if renderer.storage.spills:
+            return cls(steps, SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest, steps > 0))
+        view = view_size(renderer.backend, largest)
+        return cls(steps, *needed_bytes(renderer.fit, view, source, len(scored), options, steps > 0))
+
+
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
@@ -86,18 +108,14 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     files. Raises `BudgetError` when not even the views fit, or the disk is too small.
     """
     source, options, budget = run.source, run.options, run.budget
-    largest = largest_of(scored)
+    plan, largest = MemoryPlan.of(run, renderer, scored), largest_of(scored)
+    if plan.held + plan.least <= budget.free:
+        return IN_MEMORY
     rows, keep = source.count, EFFORTS[options.effort].keep
     whole = rows * row_bytes(source.sh_degree, keep, _most_parts(options, len(scored)))
-    distils = distil_steps(options, len(scored), source.count) > 0
-    size, least = needed_bytes(
-        renderer.fit, view_size(renderer.backend, largest), source, len(scored), options, distils
-    )
-    if size + least <= budget.free:
-        return IN_MEMORY
     budget.require(
         "a search by measured costs with all else in scratch files",
-        READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest, distils),
+        READING_BYTES + SPILLED_ROW_BYTES * rows + least_spilled(renderer, source, largest, plan.steps > 0),
     )
     storage, budget.heap = ScratchStorage(folder, budget.limit), None
     budget.take("reading scratch files", READING_BYTES)  # until the process ends
@@ -106,7 +124,7 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     LOG.info(
         "%d Gaussians and the rounds of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(usually about %s, at most %s; --scratch names another folder)",
-        rows, format_size(size + least), format_size(budget.free), storage.folder, format_size(most // USUAL_SHARE),
+        rows, format_size(plan.held + plan.least), format_size(budget.free), storage.folder, format_size(most // USUAL_SHARE),
         format_size(most),
     )  # fmt: skip
     return storage

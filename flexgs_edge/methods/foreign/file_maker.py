@@ -17,9 +17,8 @@ import numpy as np
 
 from flexgs_edge.files import check_writable
 from flexgs_edge.goals.target import Measurement
-from flexgs_edge.io.exchange import read_foreign, write_foreign
+from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
 from flexgs_edge.io.formats import Format
-from flexgs_edge.io.geometry import read_geometry
 from flexgs_edge.io.reading import PLAIN, Writing
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import nonzero_sh
@@ -28,8 +27,25 @@ from flexgs_edge.run.judge import Judge, measurement_of
 from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
+from flexgs_edge.scene.lower_sh import TrimmedSource
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.bench import Bench
+
+
+def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
+    """Write a scene without SH in a format and read it back: the geometry that `write_foreign` would give.
+
+    Positions, scales, rotations and opacities are the same as with SH.
+
+    Returns a source of SH degree 0, and [N] i64: the row of `source` behind each row.
+    """
+    path = folder / f"geometry{format.suffix}"
+    write_foreign(path, TrimmedSource(source, np.ones(0, bool), 0), force=True)
+    try:
+        return read_foreign(path), written_order(source)
+    finally:
+        path.unlink()
+
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -98,7 +114,7 @@ class FileMaker:
             return path, read_foreign(path)
 
     def geometry(self, source: SceneSource) -> tuple[SceneSource, np.ndarray]:
-        """See `flexgs_edge.io.geometry.read_geometry`."""
+        """See `flexgs_edge.methods.foreign.file_maker.read_geometry`."""
         with self._converting(source.count):
             return read_geometry(self.folder, source, self.format)
 

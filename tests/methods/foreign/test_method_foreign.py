@@ -18,10 +18,10 @@ from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS, WRITTEN
 from flexgs_edge.io.frames import RDF
-from flexgs_edge.io.geometry import read_geometry
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.methods.foreign.file_maker import read_geometry
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
