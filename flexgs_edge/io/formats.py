@@ -56,12 +56,10 @@ class Format:
         It holds the origin of a scene far from zero apart, in float64.
     max_degree : int
         Highest SH degree.
-    one_degree : bool
-        Only a lower SH degree of the whole scene saves bytes; SH that are zero take as much as others.
-    row_bytes : float
-        Approximate bytes of a Gaussian of SH degree 3, where searches start.
-    sh_bytes : float
-        Bytes of SH among them.
+    fixed_rows : bool
+        All rows take the same bytes: neither coarser values nor SH of zero save any.
+    row_bytes, sh_bytes : float
+        Bytes of a fixed row of SH degree 3, and of SH among them.
     memory : int
         Most bytes a Gaussian that writing and reading back hold.
     marks_antialiased : bool
@@ -76,9 +74,9 @@ class Format:
     position_error: Callable[[np.ndarray, float], np.ndarray] = _as_float32
     keeps_origin: bool = False
     max_degree: int = 3
-    one_degree: bool = False
-    row_bytes: float = 20.0
-    sh_bytes: float = 5.0
+    fixed_rows: bool = False
+    row_bytes: float = 0.0
+    sh_bytes: float = 0.0
     memory: int = 512
     marks_antialiased: bool = False
 
@@ -109,27 +107,27 @@ FORMATS: dict[str, Format] = {
     for format in (
         Format(
             ".spz", f"{_IO}.spz:read_spz", f"{_IO}.spz_writer:write_spz", RUB, reach=2.0**23 - 1,
-            position_error=_fixed_point, max_degree=4, row_bytes=22.0, sh_bytes=5.5, marks_antialiased=True,
+            position_error=_fixed_point, max_degree=4, marks_antialiased=True,
         ),
         Format(
             ".sog", f"{_IO}.sog:read_sog", f"{_IO}.sog_writer:write_sog",
-            position_error=_logarithmic, row_bytes=24.0, sh_bytes=11.0, memory=1024, marks_antialiased=True,
+            position_error=_logarithmic, memory=1024, marks_antialiased=True,
         ),
         Format("lod-meta.json", f"{_IO}.streamed_sog:read_streamed_sog"),
         Format("meta.json", f"{_IO}.sog:read_sog_folder"),
         # 16 bytes, 45 bytes of SH, and 72 bytes for each chunk of 256 rows.
         Format(
             ".compressed.ply", f"{_IO}.compressed_ply:read_compressed_ply", f"{_IO}.compressed_ply:write_compressed_ply",
-            one_degree=True, row_bytes=61.3, sh_bytes=45.0,
+            fixed_rows=True, row_bytes=61.3, sh_bytes=45.0,
         ),
         Format(
             ".splat", f"{_IO}.splat:read_splat", f"{_IO}.splat:write_splat",
-            max_degree=0, one_degree=True, row_bytes=32.0, sh_bytes=0.0,
+            max_degree=0, fixed_rows=True, row_bytes=32.0, sh_bytes=0.0,
         ),
         Format(".ksplat", f"{_IO}.ksplat:read_ksplat"),
         Format(
             ".glb", f"{_IO}.gltf:read_gltf", f"{_IO}.glb_writer:write_glb", LUF,
-            keeps_origin=True, one_degree=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
+            keeps_origin=True, fixed_rows=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
         ),
         Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
     )

@@ -54,11 +54,6 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
         return None
     if options.method == "paper":
         raise InputError(f"--method paper writes .fgs files alone, not {format.suffix}; leave it out, or write a .fgs")
-    if options.distil:
-        raise InputError(
-            f"--distil {options.distil}: distilling ends on the grid of a .fgs, {format.suffix} has its own; "
-            "leave it out, or write a .fgs"
-        )
     if options.layers is not None and options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
     if options.preview:

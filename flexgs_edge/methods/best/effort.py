@@ -161,14 +161,12 @@ def effort_of(options: CompressOptions) -> Effort:
     return plan if options.distil is None else replace(plan, interleaved=0)
 
 
-def distil_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False, fine: bool = False) -> int:
+def distil_steps(options: CompressOptions, poses: int, count: int, fine: bool = False) -> int:
     """Steps of the descent to a candidate; 0 for none.
 
-    `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `foreign`: the file
-    has another format than `.fgs`, with a grid of its own. `fine`: the poses have every pixel: see `is_fine`.
+    `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `fine`: the poses have
+    every pixel: see `is_fine`.
     """
-    if foreign:
-        return 0
     if options.distil is not None:
         return options.distil
     plan = EFFORTS[options.effort]

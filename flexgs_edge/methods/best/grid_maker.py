@@ -100,6 +100,7 @@ class Descents:
         return self.passes >= FULL_PASSES
 
 
+FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 FAR = 0.1  # Log of the share from which on we ask whether the descent mended anything
@@ -108,10 +109,15 @@ PRICED, ABOVE = -0.035, 0.02
 results that are too large can be trimmed: docs/results/tuning.md#landing"""
 
 
+Choose = Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
+"""Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier."""
+
+
 class GridMaker:
     """Makes grids that are coded in container version 2; a `Maker`.
 
-    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay.
+    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay. For files of
+    another format, `size_of` and `decoded` write the file of a grid and read it back.
     """
 
     def __init__(
@@ -123,18 +129,21 @@ class GridMaker:
         refit: bool = True,  # refit the colours of each candidate (default)
         steps: int = 0,  # Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
         see: Callable[[Sequence[int], int], bool] | None = None,
+        decoded: Callable[[GridScene], Planes] | None = None,  # values of a grid's file; `None`: those of the grid
+        chosen: Choose = choose,
+        bits: BitModel | None = None,
+        fixed_rows: bool = False,  # coarser steps save no bytes
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure
+        self._fixed_rows = fixed_rows
+        self._is_file = decoded is not None
+        self._decoded = decoded or (lambda grid: values_of(grid, rounds.storage))
         self.effort, self.refit, self.steps, self.close = effort, refit, steps, effort.close
-        self.selection = Selection(rounds, effort.keep, self.choose, BitModel())
+        self.selection = Selection(rounds, effort.keep, chosen, bits or BitModel())
         self._see = see
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
         self._guess, self._left = Guess(measure), 0.0
-
-    def choose(self, costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows to keep ([n] bool), and their SH degrees ([n] u8)."""
-        return choose(costs, bits, multiplier)
 
     def start(self, target: Target) -> float:
         """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
@@ -159,7 +168,7 @@ class GridMaker:
         by_size = target.limit_bytes is not None
         grid = self._distilled(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
-        if not (self.steps and self.refit) or by_size or candidate.excess <= FAR:
+        if not (self.steps and self.refit) or by_size or self._is_file or candidate.excess <= FAR:
             return candidate, grid
         before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         if before > candidate.excess:
@@ -255,7 +264,8 @@ class GridMaker:
         if self._slopes is None:
             # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
             self._slopes = self._probe_slopes(snapshot)
-        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        worth = FIXED_BITS * multiplier if self._fixed_rows else multiplier
+        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), worth)
         count = len(kept.rows)
         kept = kept.take(reachable(step_sizes, kept.planes, kept.weight2 > 0), self.rounds.storage)
         kept.left_out = count - len(kept.rows)
@@ -266,7 +276,8 @@ class GridMaker:
 
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
-        moved = self._distil(kept, self._schedule(1.0, kept.planes, multiplier=multiplier), step_sizes)
+        worth = 0.0 if self._fixed_rows else multiplier
+        moved = self._distil(kept, self._schedule(1.0, kept.planes, multiplier=worth), step_sizes)
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -307,7 +318,7 @@ class GridMaker:
         size, limit = self.size_of(grid), target.limit_bytes
         if limit is not None and 0.0 < math.log(size / limit) <= REACH:
             grid, size = self._landed(grid, size, limit)
-        measurement = self.measure(values_of(grid, self.rounds.storage))
+        measurement = self.measure(self._decoded(grid))
         excess, seconds = target.excess(size, measurement), time.perf_counter() - started
         return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out), grid
 
