@@ -29,8 +29,7 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.view_set import find_views

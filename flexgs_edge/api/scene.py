@@ -13,8 +13,7 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import choose_origin, origin_rows
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import CheckedScene, checked_scene, load_scene
+from flexgs_edge.run.inputs import CheckedScene, checked_scene, companions_of, load_scene
 from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
 from flexgs_edge.run.run import open_run

@@ -11,8 +11,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.methods.paper.score_cache import score_cache
-from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scene
+from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_cache, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
 from flexgs_edge.run.decoding import decode_bytes, read_often

@@ -14,9 +14,8 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.quality.exposure import exposure_gains, with_gains
 from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
-from flexgs_edge.quality.psnr import contrast, far_bases, mse
+from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, mse, with_gains
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene

@@ -22,10 +22,9 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.material import Live, Material, Rig, Shot
+from flexgs_edge.report.material import FLIP_SCALE, Live, Material, Rig, Shot, error_map, ramp
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
-from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.inputs import CheckedScene

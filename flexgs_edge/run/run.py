@@ -12,9 +12,17 @@ from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of, merge_companions
 from flexgs_edge.run.doubts import frame_doubts
-from flexgs_edge.run.inputs import LOG, CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
+from flexgs_edge.run.inputs import (
+    LOG,
+    CheckedScene,
+    Options,
+    ScenePlace,
+    companions_of,
+    load_scene,
+    merge_companions,
+    resolve_drawing,
+)
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output

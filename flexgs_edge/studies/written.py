@@ -17,8 +17,7 @@ from flexgs_edge.report.summary import device_words
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_bench import bench_info
 from flexgs_edge.run.view_set import views_info
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import json_bytes
+from flexgs_edge.studies.result_tables import Experiment, json_bytes
 from flexgs_edge.studies.study_scene import StudyScene
 
 LOG = logging.getLogger("flexgs_edge")

@@ -14,8 +14,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import ViewOptions

@@ -9,8 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance, between
-from flexgs_edge.cameras.nearness import nearest, squared_distances
-from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture
+from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture, nearest, squared_distances
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps

@@ -17,8 +17,7 @@ from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, Step, step_words
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
-from flexgs_edge.methods.paper.score_cache import score_cache
-from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.scores import score_cache, score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
 from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity, search_bits
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes

@@ -15,9 +15,8 @@ from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
-from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.paper.pruning import RATES
-from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)

@@ -14,8 +14,7 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.run.judge import Judge
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
+from flexgs_edge.studies.result_tables import Cell, Experiment, Row, Table, columns
 from flexgs_edge.studies.stability.ours import (
     BEST,
     BREAK,

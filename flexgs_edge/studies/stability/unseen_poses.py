@@ -13,8 +13,7 @@ from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.run.few_poses import evenly
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
+from flexgs_edge.studies.result_tables import Cell, Experiment, Row, Table, columns
 from flexgs_edge.studies.stability.ours import BEST, BREAK, LOST, WORDS, Contenders, curve, number
 from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths

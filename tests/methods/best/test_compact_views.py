@@ -17,7 +17,7 @@ from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import sum_row_bytes
-from flexgs_edge.render.camera_record import camera_record
+from flexgs_edge.render.ahead import camera_record
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
