@@ -18,7 +18,6 @@ from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.live import live_scenes
@@ -28,6 +27,7 @@ from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
+from flexgs_edge.run.warnings import view_warnings
 from flexgs_edge.views.bench import Bench
 
 LOG = logging.getLogger("flexgs_edge")
@@ -86,9 +86,9 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
     held_out = None
     if made.quality is not None and made.trained is not None:
         held_out = measurement_of(made.quality).figure("fidelity")
-    warnings = doubts(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
+    warnings = view_warnings(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
     reached = search.reached if search and options.fixed is None else None
-    warnings += _default_doubts(run, reached, search)
+    warnings += _default_warnings(run, reached, search)
     promise = kept_promise(plan.target, made.size, search.chosen.measurement) if search else None
     for warning in warnings:
         LOG.warning("warning: %s", warning)
@@ -124,11 +124,11 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         preview_bytes=made.preview_bytes,
         scored=scored,
         training_fidelity=made.trained,
-        warnings=(*run.doubts, *warnings),
+        warnings=(*run.warnings, *warnings),
     )
 
 
-def _default_doubts(run: Run[CompressOptions], reached: bool | None, search: SearchResult | None) -> tuple[str, ...]:
+def _default_warnings(run: Run[CompressOptions], reached: bool | None, search: SearchResult | None) -> tuple[str, ...]:
     """Warn if the default target was missed, or if a size leaves no room for the promise."""
     format, plan = run.output.format, run.plan
     if plan is None or plan.target is None or search is None:

@@ -82,7 +82,7 @@ def evaluate(
             quality=quality,
             quality_views="held-out" if views.held_out else "training",
             run=bench_info(run, bench),
-            warnings=run.doubts,
+            warnings=run.warnings,
         )
     if reporter is not None:
         reporter.read_contents(input)

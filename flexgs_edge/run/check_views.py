@@ -78,7 +78,7 @@ def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
     Returns
     -------
     Run
-        With the warnings among its doubts.
+        With the words among its warnings.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
     if fatal and not trusted:
         raise InputError(f"{views.cameras_from}: {words} --trust-views goes on all the same.")
     LOG.warning("warning: %s", words)
-    return replace(run, doubts=(*run.doubts, words))
+    return replace(run, warnings=(*run.warnings, words))
 
 
 def _find_fault(run: Run[Options], renderer: Renderer, views: ViewSet) -> tuple[str, bool] | None:

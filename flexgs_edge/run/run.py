@@ -12,7 +12,6 @@ from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.doubts import frame_doubts
 from flexgs_edge.run.inputs import (
     LOG,
     CheckedScene,
@@ -29,6 +28,7 @@ from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views, near_enough
+from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import SceneSource
 
 
@@ -46,7 +46,7 @@ class Run(Generic[Options]):
     reporter: Reporter | None = None  # gathers the pages of `--report`
     output: Output = NO_OUTPUT  # the file that `compress` writes
     judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
-    doubts: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
+    warnings: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
 
     @property
     def source(self) -> SceneSource:
@@ -111,10 +111,10 @@ def open_run(
             reporter.see_cameras(views, scene)
         # A page shows a `.fgs` as it is: the browser decodes it, and we do not.
         unread = not photos and scene.path is not None and is_fgs(scene_file(scene.path))
-        found = () if views is None or unread else frame_doubts(views, scene)
+        found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
-    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, doubts=found)
+    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, warnings=found)
 
 
 def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:

@@ -269,7 +269,7 @@ def scored_poses(
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
-    A few poses chosen like this give costs about as good as all poses do: docs/results/speed.md#scoring-fewer-views
+    A few poses chosen like this give costs about as good as all poses do.
 
     With `makes_poses`, generated poses come on top: see `margin_of` and `needed_poses`.
 
