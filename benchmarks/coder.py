@@ -30,8 +30,8 @@ from flexgs_edge.progress import Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
-from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -98,7 +98,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
     backend = open_backend(device, budget)
     source, cameras = scene.source, views.of(views.train)
     renderer = Renderer(backend, budget, near=DEFAULT_NEAR)
-    judge = Judge(Bench(renderer), source, views, views.held_out)
+    judge = QualityEvaluator(Bench(renderer), source, views, views.held_out)
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)

@@ -19,12 +19,12 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.inputs import ScenePlace, scene_info
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.live import live_scenes
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.run.warnings import view_warnings

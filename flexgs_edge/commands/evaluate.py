@@ -16,9 +16,9 @@ from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
@@ -65,7 +65,7 @@ def evaluate(
         with clock.stage("load"):
             spare = drawing_bytes(run) + decode_bytes(scene.source, None)
             original_source = read_often(run.source, budget, spare, renderer.backend)
-        judge = Judge(bench, original_source, views, indices, base_psnr=base_psnr)
+        judge = QualityEvaluator(bench, original_source, views, indices, base_psnr=base_psnr)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(original_source) as original:
             judge.prepare(original, progress)

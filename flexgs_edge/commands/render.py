@@ -20,9 +20,9 @@ from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.judge import LIBRARY_BYTES
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import LIBRARY_BYTES
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
 

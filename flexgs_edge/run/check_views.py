@@ -23,8 +23,8 @@ from flexgs_edge.quality.psnr import mse, psnr
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import Options
-from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.options import AUTO_CAMERAS
+from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.views.bench import Bench

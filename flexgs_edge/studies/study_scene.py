@@ -22,10 +22,10 @@ from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
-from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_bench import open_bench
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.studies.result_tables import Cell
@@ -63,7 +63,7 @@ class StudyScene:
         name: str,  # name of the scene, for tables and folders
         run: Run[CompressOptions],  # As for `compress`. The plan's views and figure decide here too.
         bench: Bench,  # draws the views
-        judge: Judge,  # prepared, with the original's renders
+        judge: QualityEvaluator,  # prepared, with the original's renders
         orders: dict[str, np.ndarray],  # [N] i64 by name of the score: rows, least important first
         has_sh: np.ndarray,  # [N] bool, rows with SH that are not zero
     ) -> None:
@@ -208,7 +208,7 @@ def open_study_scene(
         bench = stack.enter_context(open_bench(run))
         renderer = bench.renderer
         run.budget.take("ranks", RANK_BYTES * source.count * len(scores))
-        judge = Judge(bench, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr)
+        judge = QualityEvaluator(bench, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr)
         stack.callback(judge.close)
         with clock.stage("load"):
             original = renderer.load(source)

@@ -1,7 +1,7 @@
 """`--method best`, the default: rate-distortion optimization with measured costs.
 
 `compress` chooses poses and storage, prunes in rounds, searches for the best candidate, writes it and measures it. The
-search asks for exact sizes (`GridCoder`) and measured quality (`Judge`).
+search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluator`).
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from flexgs_edge.methods.best.spill import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
-from flexgs_edge.run.judge import Judge, measurement_of
-from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
@@ -67,7 +67,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     """
     assert bench is not None  # the plan has refused runs without views
     output = run.output.path
-    with Judges(run, bench) as judges:
+    with Evaluators(run, bench) as judges:
         poses = choose_poses(run, bench, judges.decide)
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
         storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)
@@ -150,7 +150,7 @@ def _tried(
     grid: GridScene,
     settings: dict[str, Any],
     preview: bytes,
-    judges: Judges,
+    judges: Evaluators,
 ) -> tuple[int, Quality]:
     """Bytes and quality of the file in a dry run. A report reads the contents from a file that is removed afterwards."""
     if run.reporter is not None:
@@ -175,7 +175,7 @@ def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]
     return make
 
 
-def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> ScoredPoses:
+def choose_poses(run: Run[CompressOptions], bench: Bench, judge: QualityEvaluator) -> ScoredPoses:
     """`scored_poses` for a run.
 
     `run`: planned. `bench`: its renderer has nothing loaded. `judge`: on the views that decide.
@@ -196,7 +196,7 @@ def search_best(
     run: Run[CompressOptions],  # Planned. The storage of `bench.renderer` holds its scene as a whole.
     bench: Bench,  # draws the views
     poses: ScoredPoses,  # from `scored_poses`
-    judge: Judge,  # prepared on the views that decide
+    judge: QualityEvaluator,  # prepared on the views that decide
     checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run (`--resume`)
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
@@ -266,7 +266,7 @@ def search_rounds(
     make: MakerOf[Product],
     rounds: PruneRounds,
     run: Run[CompressOptions],
-    judge: Judge,
+    judge: QualityEvaluator,
     on_step: Callable[[Step], None] | None = None,
     see: See | None = None,
 ) -> tuple[Product, SearchResult]:

@@ -23,9 +23,9 @@ from flexgs_edge.io.reading import PLAIN, Writing
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.judge import Judge, measurement_of
-from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.lower_sh import TrimmedSource
 from flexgs_edge.scene.source import SceneSource
@@ -66,7 +66,7 @@ class WrittenFile:
 
 @contextmanager
 def open_files(
-    run: Run[CompressOptions], format: Format, bench: Bench | None = None, judges: Judges | None = None
+    run: Run[CompressOptions], format: Format, bench: Bench | None = None, judges: Evaluators | None = None
 ) -> Iterator[FileMaker]:
     """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
     output = run.output.path
@@ -88,7 +88,7 @@ class FileMaker:
         folder: Path,  # for the files
         budget: MemoryBudget,  # the memory that writing and reading back take is taken from it
         renderer: Renderer | None,
-        judge: Judge | None,
+        judge: QualityEvaluator | None,
         writing: Writing = PLAIN,  # what the user says about the format
     ) -> None:
         self.format, self.folder, self.writing = format, folder, writing

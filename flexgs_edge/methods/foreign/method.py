@@ -21,7 +21,7 @@ from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Measure, Selection
 from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile, open_files, publish
-from flexgs_edge.run.judges import Judges
+from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
@@ -155,7 +155,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     # The plan has refused runs without views.
     assert bench is not None and plan is not None and plan.target is not None and format is not None
-    with Judges(run, bench) as judges:
+    with Evaluators(run, bench) as judges:
         judges.prepare()
         if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)

@@ -24,12 +24,12 @@ from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes, read_often
+from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.foresight import drawing_bytes
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.judges import Judges
 from flexgs_edge.run.made import Made
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
@@ -45,7 +45,7 @@ def bits_by_sensitivity(
     renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
     count = min(SENSITIVITY_VIEWS, len(views.train))
     indices = [views.train[i * len(views.train) // count] for i in range(count)]
-    judge = Judge(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
+    judge = QualityEvaluator(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
     with renderer.load(source) as original:
         judge.prepare(original, run.progress)
 
@@ -84,7 +84,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
             source = read_often(run.source, run.budget, searching_bytes(run), bench.renderer.backend)
             run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
-    with nullcontext() if bench is None else Judges(run, bench) as judges:
+    with nullcontext() if bench is None else Evaluators(run, bench) as judges:
         ranking = _rank(run, judges, bench)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
@@ -136,7 +136,7 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     )
 
 
-def _rank(run: Run[CompressOptions], judges: Judges | None, bench: Bench | None) -> Ranking:
+def _rank(run: Run[CompressOptions], judges: Evaluators | None, bench: Bench | None) -> Ranking:
     """Draw the references, and score every Gaussian unless the cache has the scores."""
     assert run.plan is not None
     scores, reused, cache = None, False, None
@@ -175,7 +175,7 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
 
 
 def _write(
-    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Judges | None
+    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Evaluators | None
 ) -> Quality | None:
     """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
     settings, output = make_settings(run, search, quantized.bits), run.output.path

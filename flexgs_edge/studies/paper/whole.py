@@ -12,8 +12,8 @@ from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.report.plots import BarChart, LineChart, Series
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
 from flexgs_edge.studies.paper.pruning import RATES
 from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns

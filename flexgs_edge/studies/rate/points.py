@@ -22,9 +22,9 @@ from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.file_maker import open_files
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.outputs import Output
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.result_tables import Cell, Column, columns

@@ -13,7 +13,7 @@ from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.run.few_poses import evenly
-from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.studies.result_tables import Cell, Experiment, Row, Table, columns
 from flexgs_edge.studies.stability.ours import (
     BEST,
@@ -103,7 +103,7 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
 
 def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
     source = studied.run.source
-    judge = Judge(
+    judge = QualityEvaluator(
         studied.bench,
         source,
         studied.views,

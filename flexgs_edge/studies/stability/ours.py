@@ -28,7 +28,7 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import Series
-from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper.pruning import nearest
 from flexgs_edge.studies.result_tables import Row
@@ -109,7 +109,7 @@ def walked(
         yield rounds
 
 
-def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
+def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: QualityEvaluator | None = None) -> Whole:
     """Search for a target; the closest candidate if none meets it."""
     judge = judge or studied.judge
     made = _search(studied, rounds, judge, rounds.original.bench.renderer)
@@ -119,7 +119,7 @@ def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judg
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> GridMaker:
+def _search(studied: StudyScene, rounds: PruneRounds, judge: QualityEvaluator, renderer: Renderer) -> GridMaker:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=rounds.original.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))

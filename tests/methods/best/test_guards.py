@@ -26,9 +26,9 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.few_poses import MOST, STEP, FewPoses
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.run.warnings import FIT_GAP, NEEDED_VIEWS, warnings
 from flexgs_edge.views.depths import middle_of, visible_depths

@@ -13,13 +13,13 @@ from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.run.decoding import ahead, coding_device
 from flexgs_edge.run.few_poses import MOST, FewPoses, evenly, made_poses
-from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.bench import Bench
 
 
-class Judges:
+class Evaluators:
     """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
 
     `run`: planned, with views. `bench`: draws.
@@ -35,10 +35,10 @@ class Judges:
         self._made: FewPoses | None = None
         self.trained: float | None = None  # Fidelity of what was measured last on training poses, dB
 
-    def _judge(self, indices: list[int], reports: bool) -> Judge:
+    def _judge(self, indices: list[int], reports: bool) -> QualityEvaluator:
         run = self._run
         words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "reports": reports}
-        return Judge(self._bench, run.source, run.seen, indices, **words)
+        return QualityEvaluator(self._bench, run.source, run.seen, indices, **words)
 
     @property
     def storage(self) -> Storage:
@@ -110,7 +110,7 @@ class Judges:
             if few is not None:
                 few.close()
 
-    def __enter__(self) -> Judges:
+    def __enter__(self) -> Evaluators:
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -41,7 +41,7 @@ def work_bytes(cameras: Sequence[Camera]) -> int:
     return LIBRARY_BYTES + WORK_BYTES * max(camera.width * camera.height for camera in cameras)
 
 
-class Judge:
+class QualityEvaluator:
     """Compares a scene with the original, and with photos, over some views.
 
     Without photos, the figures over covered pixels decide: background that the original leaves empty must not dilute an
