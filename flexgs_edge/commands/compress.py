@@ -20,7 +20,7 @@ from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.live import live_scenes
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.open_bench import bench_info, open_bench
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
@@ -78,7 +78,7 @@ def _show_live(run: Run[CompressOptions], path: Path) -> None:
             run.reporter.show_live(lambda first: live_scenes(run, path, first))
 
 
-def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> CompressResult:
+def _result(run: Run[CompressOptions], bench: Bench | None, made: MethodResult) -> CompressResult:
     """The record of a run; its warnings are logged."""
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None

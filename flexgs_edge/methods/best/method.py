@@ -40,7 +40,7 @@ from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
@@ -58,7 +58,7 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 2.
 
     `run`: planned, with views and a target. `bench`: draws the views. Its renderer gets the storage that the search
@@ -104,7 +104,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
         if kept is not None:
             kept.remove()
         storage.close()
-        return Made(
+        return MethodResult(
             size=size,
             count=grid.count,
             sh_count=grid.sh_count,

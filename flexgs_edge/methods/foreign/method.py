@@ -22,7 +22,7 @@ from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Measure, Sele
 from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile, open_files, publish
 from flexgs_edge.run.evaluators import Evaluators
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -147,7 +147,7 @@ def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[WrittenFil
 LOG = logging.getLogger("flexgs_edge")
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
     """Compress a scene into a file of another program's format, by measured costs.
 
     `run`: planned. `bench`: draws the views.
@@ -168,7 +168,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
             if output is not None:
                 publish(file, output, options.force)
                 LOG.info("wrote %s, %s", output, format_size(file.size))
-        return Made(
+        return MethodResult(
             size=file.size,
             count=file.count,
             sh_count=file.sh_count,

@@ -26,7 +26,7 @@ from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.foresight import drawing_bytes
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
@@ -74,7 +74,7 @@ class Ranking:
     reused: bool = False  # whether their scores came from the cache
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 1.
 
     `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
@@ -105,7 +105,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
         assert choice is not None
         with evaluator.quantized(choice) as quantized:
             quality = _write(run, quantized, search, judges)
-        return Made(
+        return MethodResult(
             size=evaluator.size(choice),
             count=quantized.count,
             sh_count=quantized.sh_count,
