@@ -16,8 +16,8 @@ from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
+from flexgs_edge.methods.best.memory_plan import SPILLED_ROW_BYTES
 from flexgs_edge.methods.best.rounds import take_rows
-from flexgs_edge.methods.best.spill import SPILLED_ROW_BYTES
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.growth import growth

@@ -30,13 +30,13 @@ from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
+from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
+from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
 from flexgs_edge.methods.best.selection import Measure
-from flexgs_edge.methods.best.spill import MemoryPlan, choose_storage
-from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators

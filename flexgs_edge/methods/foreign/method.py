@@ -14,12 +14,12 @@ from flexgs_edge.io.exchange import near_order, read_foreign
 from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.allocation import BitModel, choose, choose_one_degree
 from flexgs_edge.methods.best.effort import EFFORTS, Effort
+from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.method import MakerOf, See, choose_poses, search_best
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import PruneRounds, take_rows
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Measure, Selection
-from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.methods.foreign.file_maker import FileMaker, WrittenFile, open_files, publish
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
