@@ -42,7 +42,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "CHROMA": (1.4, 2.8),
     "PRUNED_DISTILLED": (1.3, 2.0),
     "POWER": (4.0, 5.6),
-    "LED_STRUCTURE": (0.03, 0.055),
+    "MARGIN_STRUCTURE": (0.03, 0.055),
 }
 """Constants that the search by `balanced` rests on, by the names in the code, and other values of each."""
 BROKEN = float("inf")

@@ -22,7 +22,7 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil, share_of_lead, structure_of
+from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
@@ -35,8 +35,8 @@ the power by which it changes with the steps: docs/results/tuning.md#distilled""
 BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
-BEHIND_LED = -0.09
-"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
+BEHIND_MARGIN = -0.09
+"""What a full margin of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -75,7 +75,7 @@ class Descents:
 
     steps: int  # of the descent to a candidate; 0 for none
     poses: int  # scored poses
-    lead: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
+    ssim_margin: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
 
     @property
     def passes(self) -> float:
@@ -92,7 +92,7 @@ class Descents:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
             return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
-        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
+        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
         return (left + excess) / 2 + behind
 
     @property
@@ -338,10 +338,10 @@ class GridMaker:
 
     @property
     def _descents(self) -> Descents:
-        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.lead)
+        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.ssim_margin)
 
     def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        weight = structure_of(self._guess.lead)
+        weight = structure_of(self._guess.ssim_margin)
         return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:

@@ -23,9 +23,9 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.distil import (
     FIELD_RATES,
-    FULL_LEAD,
+    FULL_MARGIN,
     HELD,
-    LED_STRUCTURE,
+    MARGIN_STRUCTURE,
     STRUCTURE,
     Schedule,
     distil,
@@ -116,8 +116,10 @@ def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> No
 
 
 def test_structure_weighs_more_where_ssim_decides() -> None:
-    assert structure_of(0.0) == STRUCTURE < structure_of(FULL_LEAD / 2) < structure_of(FULL_LEAD) == LED_STRUCTURE
-    assert structure_of(9.0) == LED_STRUCTURE
+    assert (
+        structure_of(0.0) == STRUCTURE < structure_of(FULL_MARGIN / 2) < structure_of(FULL_MARGIN) == MARGIN_STRUCTURE
+    )
+    assert structure_of(9.0) == MARGIN_STRUCTURE
 
 
 def test_the_structural_term_keeps_structure(workshop: Workshop) -> None:

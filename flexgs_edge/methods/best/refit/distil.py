@@ -22,9 +22,9 @@ from flexgs_edge.views.original import Original
 FIELD_RATES = {"log_scales": 4e-2, "quats": 4.8e-3, "opacity_logits": 8e-2, "sh_dc": 8e-3, "sh_rest": 1e-3}
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
-STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
-"""Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the lead of SSIM
-from which the second one holds in full. A lead is the log of how much more of its bound SSIM has used than the mean:
+STRUCTURE, MARGIN_STRUCTURE, FULL_MARGIN = 0.02, 0.04, 0.3
+"""Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the margin
+of SSIM from which the second one holds in full, the log of how much more of its bound SSIM has used than the mean:
 docs/results/tuning.md#led_structure"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
@@ -97,14 +97,14 @@ class Schedule:
         return np.concatenate(rounds)[: self.iterations]
 
 
-def structure_of(lead: float) -> float:
-    """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `lead`, which is 0 or more."""
-    return STRUCTURE + (LED_STRUCTURE - STRUCTURE) * share_of_lead(lead)
+def structure_of(ssim_margin: float) -> float:
+    """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `ssim_margin`, 0 or more."""
+    return STRUCTURE + (MARGIN_STRUCTURE - STRUCTURE) * share_of_margin(ssim_margin)
 
 
-def share_of_lead(lead: float) -> float:
-    """0 where the mean decides, up to 1 where SSIM leads by `FULL_LEAD` or more."""
-    return min(lead / FULL_LEAD, 1.0)
+def share_of_margin(ssim_margin: float) -> float:
+    """0 where the mean decides, up to 1 where SSIM leads by `FULL_MARGIN` or more."""
+    return min(ssim_margin / FULL_MARGIN, 1.0)
 
 
 def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
