@@ -28,7 +28,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.packed.quantize import quantize_scene

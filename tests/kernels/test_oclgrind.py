@@ -28,7 +28,7 @@ from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.quality.flip import flips
 from flexgs_edge.quality.ssim import ssims
 from flexgs_edge.render.fit import Fit

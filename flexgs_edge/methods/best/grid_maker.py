@@ -22,7 +22,7 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil, share_of_margin, structure_of
+from flexgs_edge.methods.best.refit.finetune import LAST, LONG, SHORT, Schedule, finetune, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
@@ -157,7 +157,7 @@ class GridMaker:
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
         by_size = target.limit_bytes is not None
-        grid = self._distilled(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
+        grid = self._finetuned(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
         if not (self.steps and self.refit) or by_size or candidate.excess <= FAR:
             return candidate, grid
@@ -229,7 +229,7 @@ class GridMaker:
         """Rows and planes after a cut by half a round and a descent off the grid."""
         kept = self.selection.kept(self.selection.cut())
         schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=INTERLEAVED_LAST)
-        return kept.rows, self._distil(kept, schedule)
+        return kept.rows, self._finetune(kept, schedule)
 
     def _after(self, excess: float) -> float:
         """Expected excess of a candidate after its refit or descent, from that before it."""
@@ -261,12 +261,12 @@ class GridMaker:
         kept.left_out = count - len(kept.rows)
         return kept, holdable(step_sizes, kept.planes)
 
-    def _distilled(self, kept: Kept, step_sizes: StepSizes, multiplier: float) -> GridScene:
+    def _finetuned(self, kept: Kept, step_sizes: StepSizes, multiplier: float) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour.
 
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
-        moved = self._distil(kept, self._schedule(1.0, kept.planes, multiplier=multiplier), step_sizes)
+        moved = self._finetune(kept, self._schedule(1.0, kept.planes, multiplier=multiplier), step_sizes)
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -340,9 +340,9 @@ class GridMaker:
     def _descents(self) -> Descents:
         return Descents(self.steps, len(self.rounds.original.cameras), self._guess.ssim_margin)
 
-    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
+    def _finetune(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         weight = structure_of(self._guess.ssim_margin)
-        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
+        return finetune(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

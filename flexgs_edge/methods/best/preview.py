@@ -25,7 +25,7 @@ from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.choose_steps import holdable
 from flexgs_edge.methods.best.effort import STEP_UNIT
 from flexgs_edge.methods.best.layers import worthiest
-from flexgs_edge.methods.best.refit.distil import SHORT, Schedule, distil
+from flexgs_edge.methods.best.refit.finetune import SHORT, Schedule, finetune
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.scene.growth import growth
@@ -140,7 +140,7 @@ def _stage(
     kept = take_rows(planes, np.sort(left), bench.renderer.storage)
     kept["log_scales"] += growth(len(left), count)
     steps = None if step_sizes is None else holdable(_coarse(step_sizes), kept)
-    return distil(kept, degrees[left], original, schedule, steps)
+    return finetune(kept, degrees[left], original, schedule, steps)
 
 
 def _coarse(steps: StepSizes) -> StepSizes:

@@ -21,14 +21,14 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import (
+from flexgs_edge.methods.best.refit.finetune import (
     FIELD_RATES,
     FULL_MARGIN,
     HELD,
     MARGIN_STRUCTURE,
     STRUCTURE,
     Schedule,
-    distil,
+    finetune,
     structure_of,
 )
 from flexgs_edge.quality.ssim import ssims
@@ -86,7 +86,7 @@ class Workshop:
 
     def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
         structure = words.pop("structure", STRUCTURE)
-        return distil(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
+        return finetune(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
 
     @property
     def seen(self) -> Original:
@@ -211,7 +211,7 @@ def test_too_little_memory_is_said_and_leaves_nothing_taken(
         renderer = Renderer(TwinBackend(budget), budget)
         try:
             original = Original(Bench(renderer), np.zeros(3), workshop.cameras, workshop.references)
-            distil(workshop.kept, workshop.degrees, original, Schedule(1))
+            finetune(workshop.kept, workshop.degrees, original, Schedule(1))
         except BudgetError as error:
             refused.append(str(error))
         else:

@@ -16,7 +16,7 @@ from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import RemovalCosts
 from flexgs_edge.methods.best.layers import SORTED_ROW_BYTES, worthiest
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.growth import growth

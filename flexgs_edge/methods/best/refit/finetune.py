@@ -1,4 +1,4 @@
-"""Self-distillation: fine-tunes all values of the remaining Gaussians against renders of the original.
+"""Fine-tunes all values of the remaining Gaussians against renders of the original.
 
 It needs no photos and adds no Gaussians, so the result cannot look better than the original.
 """
@@ -114,7 +114,7 @@ def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
     return {"means": means_rate * extent, **FIELD_RATES}
 
 
-def distil(
+def finetune(
     planes: dict[str, np.ndarray],  # stored planes of the kept Gaussians ([width, n] f32 by field); not changed
     degrees: np.ndarray,  # [n] u8, SH degree kept for each row. Coefficients above it stay zero.
     original: Original,
@@ -151,7 +151,7 @@ def distil(
                 if held and len(parts[1]):
                     descent.settle()
                 descent.put_on(step_sizes)
-            for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
+            for k in original.progress.track(part, f"fine-tuning{' on the grid' if place else ''}", len(part)):
                 now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 # On the grid, a plain mean first, then one that forgets: single views then decide little.
