@@ -44,9 +44,9 @@ FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVE_TO, MOST_LEFT = 0.8, 0.9
-"""The first candidate comes once two descents in a row leave more than the first share of the loss that the target allows. One
-that leaves more than the second does not count: docs/results/tuning.md#interleaved"""
+INTERLEAVE_TO = 0.8
+"""The first candidate comes once two descents in a row leave more than this share of the loss that the target allows:
+docs/results/tuning.md#interleaved"""
 MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
 many; and most descents: docs/results/tuning.md#interleaved"""
@@ -102,7 +102,6 @@ class Descents:
 
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
-FAR = 0.1  # Log of the share from which on we ask whether the descent mended anything
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""
@@ -159,7 +158,7 @@ class GridMaker:
         by_size = target.limit_bytes is not None
         grid = self._finetuned(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
-        if not (self.steps and self.refit) or by_size or candidate.excess <= FAR:
+        if not (self.steps and self.refit) or by_size or candidate.excess <= 0.0:
             return candidate, grid
         before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         if before > candidate.excess:
@@ -217,8 +216,6 @@ class GridMaker:
                 planes = self.selection.last.planes
                 self._guess.learn(planes, target)
                 after = self._guess(planes, target)
-                if after >= math.log(MOST_LEFT):
-                    break
                 self._left = after
             self.selection.begin = len(self.rounds.snapshots) - 1
             # One alone may leave more by chance.

@@ -119,7 +119,6 @@ def test_descents_between_the_rounds_are_not_done_again(
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
     monkeypatch.setitem(EFFORTS, "max", replace(EFFORTS["max"], interleaved=3))
     monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVE_TO", 99.0)
-    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.MOST_LEFT", 99.0)
     words: dict[str, Any] = {**TINY, "effort": "max"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}
