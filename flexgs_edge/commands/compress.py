@@ -21,14 +21,14 @@ from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.live import live_scenes
 from flexgs_edge.run.method_result import MethodResult
-from flexgs_edge.run.open_bench import bench_info, open_bench
+from flexgs_edge.run.open_context import context_info, open_context
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.run.warnings import view_warnings
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -55,15 +55,15 @@ def compress(
     run = open_compression(input, output, options, progress, given)
     method = paper if options.method == "paper" else best if run.output.format is None else foreign
     with ExitStack() as stack:
-        bench = None
+        context = None
         if run.views is None:
             run.budget.require("the scene", 0)
         else:
             needed = partial(method.expected_bytes, run)
-            bench = stack.enter_context(open_bench(run, options.cluster, needed))
-            run = check_views(run, bench, options.trust_views)
-        made = method.compress(run, bench)
-        result = _result(run, bench, made)
+            context = stack.enter_context(open_context(run, options.cluster, needed))
+            run = check_views(run, context, options.trust_views)
+        made = method.compress(run, context)
+        result = _result(run, context, made)
     if run.reporter is not None:
         if run.output.path is not None:
             run.reporter.read_contents(run.output.path)
@@ -78,7 +78,7 @@ def _show_live(run: Run[CompressOptions], path: Path) -> None:
             run.reporter.show_live(lambda first: live_scenes(run, path, first))
 
 
-def _result(run: Run[CompressOptions], bench: Bench | None, made: MethodResult) -> CompressResult:
+def _result(run: Run[CompressOptions], context: RenderContext | None, made: MethodResult) -> CompressResult:
     """The record of a run; its warnings are logged."""
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None
@@ -118,7 +118,7 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: MethodResult) 
         quality_views=plan.kind_of(plan.report, views),
         score_cache=options.score_cache if plan.needs_scores else None,
         scores_reused=made.scores_reused,
-        run=bench_info(run, bench),
+        run=context_info(run, context),
         format=run.output.format.suffix[1:] if run.output.format else "fgs",
         file_sh_degree=made.sh_degree,
         preview_bytes=made.preview_bytes,

@@ -27,7 +27,7 @@ from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -63,14 +63,14 @@ class _Compared:
         return [math.nan if a is None and b is None else likeness(a, b) for a, b in pairs]
 
 
-def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
+def check_views(run: Run[Options], context: RenderContext, trusted: bool) -> Run[Options]:
     """Compare some views with their photos (stage `check views`).
 
     Parameters
     ----------
     run : Run
         With views.
-    bench : Bench
+    context : RenderContext
         Draws; nothing is loaded afterwards.
     trusted : bool
         Warn of views that do not belong to the scene, and go on.
@@ -89,7 +89,7 @@ def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
     if views.cameras_from == AUTO_CAMERAS:
         return run
     with run.clock.stage("check views"):
-        found = _find_fault(run, bench.renderer, views)
+        found = _find_fault(run, context.renderer, views)
     if found is None:
         return run
     words, fatal = found

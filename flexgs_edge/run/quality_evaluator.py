@@ -24,7 +24,7 @@ from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 SHARE = 4
 """Reference images take at most one part in `SHARE` of the free budget. The scene and its views need the rest."""
@@ -54,7 +54,7 @@ class QualityEvaluator:
 
     def __init__(
         self,
-        bench: Bench,  # Draws both scenes. Kept images take at most a quarter of its free budget.
+        context: RenderContext,  # Draws both scenes. Kept images take at most a quarter of its free budget.
         source: SceneSource,  # The original. A reference that was not kept is drawn again.
         views: ViewSet,  # all views of the run
         indices: Sequence[int],  # the views to compare
@@ -62,8 +62,8 @@ class QualityEvaluator:
         base_psnr: float = DEFAULT_BASE_PSNR,  # PSNR of the original that the modelled drop starts from, dB
         reports: bool = False,
     ) -> None:
-        self.bench, self.renderer = bench, bench.renderer
-        budget = bench.renderer.budget
+        self.context, self.renderer = context, context.renderer
+        budget = context.renderer.budget
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
@@ -193,14 +193,14 @@ class QualityEvaluator:
 
         `lpips`: also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.context.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
         known = self._known.get(drawn) if drawn is not None else None
         if known is not None and (known.worst_flip or not flip):
             return known
         ssims, flips = self._ssims if with_ssim else None, self._flips if flip else None
         found: list[ViewQuality] = []
-        images = self.bench.images(scene, self.cameras)
+        images = self.context.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error, similar = self._original_error[i] if self.photos is not None else None, self._original_ssim.get(i)
             original = self.original(i)

@@ -17,16 +17,16 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import InputError
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import CompressOptions, ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 WIDTH = 120
-Opened = tuple[Run[ViewOptions], Bench]
+Opened = tuple[Run[ViewOptions], RenderContext]
 Load = Callable[[int], np.ndarray]
 
 
@@ -41,7 +41,7 @@ class MadePhotos:
 def opened(sample_dir: Path) -> Iterator[Opened]:
     """The bundled scene with small views."""
     run = open_run(sample_dir / "point_cloud.ply", ViewOptions(resolution=WIDTH))
-    with open_bench(run) as bench:
+    with open_context(run) as bench:
         yield run, bench
 
 

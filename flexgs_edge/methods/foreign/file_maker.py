@@ -29,7 +29,7 @@ from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.lower_sh import TrimmedSource
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 
 def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
@@ -66,12 +66,12 @@ class WrittenFile:
 
 @contextmanager
 def open_files(
-    run: Run[CompressOptions], format: Format, bench: Bench | None = None, judges: Evaluators | None = None
+    run: Run[CompressOptions], format: Format, context: RenderContext | None = None, judges: Evaluators | None = None
 ) -> Iterator[FileMaker]:
     """A `FileMaker` with a folder beside `output` (in a dry run: in TMPDIR), which is removed when the block ends."""
     output = run.output.path
     beside = None if output is None else check_writable(output, run.options.force).parent
-    renderer, judge = None if bench is None else bench.renderer, None if judges is None else judges.decide
+    renderer, judge = None if context is None else context.renderer, None if judges is None else judges.decide
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
         yield FileMaker(format, Path(folder), run.budget, renderer, judge, run.options.writing)
 

@@ -29,7 +29,7 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.lower_sh import lower_degree
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 
 class CostMaker:
@@ -147,22 +147,22 @@ def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[WrittenFil
 LOG = logging.getLogger("flexgs_edge")
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
+def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
     """Compress a scene into a file of another program's format, by measured costs.
 
-    `run`: planned. `bench`: draws the views.
+    `run`: planned. `context`: draws the views.
     """
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     # The plan has refused runs without views.
-    assert bench is not None and plan is not None and plan.target is not None and format is not None
-    with Evaluators(run, bench) as judges:
+    assert context is not None and plan is not None and plan.target is not None and format is not None
+    with Evaluators(run, context) as judges:
         judges.prepare()
         if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
-        poses = choose_poses(run, bench, judges.decide)
-        with open_files(run, format, bench, judges) as files:
+        poses = choose_poses(run, context, judges.decide)
+        with open_files(run, format, context, judges) as files:
             LOG.info("searching for %s", plan.target.describe())
-            file, search = search_best(file_maker(options, files), run, bench, poses, judges.decide)
+            file, search = search_best(file_maker(options, files), run, context, poses, judges.decide)
             judges.decided()
             quality = judges.measure(read_foreign(file.path))
             if output is not None:

@@ -33,19 +33,19 @@ from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
 
 
 def bits_by_sensitivity(
-    evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
+    evaluator: SceneEvaluator, run: Run[CompressOptions], context: RenderContext
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
-    renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
+    renderer, source, views, base_psnr = context.renderer, evaluator.source, run.seen, run.options.base_psnr
     count = min(SENSITIVITY_VIEWS, len(views.train))
     indices = [views.train[i * len(views.train) // count] for i in range(count)]
-    judge = QualityEvaluator(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
+    judge = QualityEvaluator(context, source, views, indices, with_photos=False, base_psnr=base_psnr)
     with renderer.load(source) as original:
         judge.prepare(original, run.progress)
 
@@ -74,18 +74,18 @@ class Ranking:
     reused: bool = False  # whether their scores came from the cache
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
+def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 1.
 
-    `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
+    `run`: planned. `context`: draws the views; `None` for runs without views, whose rates are fixed.
     """
-    if bench is not None:
+    if context is not None:
         with run.clock.stage("open"):  # the search reads the scene for every choice that it measures
-            source = read_often(run.source, run.budget, searching_bytes(run), bench.renderer.backend)
+            source = read_often(run.source, run.budget, searching_bytes(run), context.renderer.backend)
             run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
-    with nullcontext() if bench is None else Evaluators(run, bench) as judges:
-        ranking = _rank(run, judges, bench)
+    with nullcontext() if context is None else Evaluators(run, context) as judges:
+        ranking = _rank(run, judges, context)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
@@ -93,9 +93,9 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> MethodResult:
         evaluator = SceneEvaluator(ranked, PAPER, groups, None if judges is None else judges.decide, run.budget)
         sensitivity: list[Sensitivity] = []
         if bits is None:
-            assert bench is not None
+            assert context is not None
             with run.clock.stage("sensitivity"):
-                bits, sensitivity = bits_by_sensitivity(evaluator, run, bench)
+                bits, sensitivity = bits_by_sensitivity(evaluator, run, context)
         evaluator.bits = bits
         with run.clock.stage("search"):
             search = _search(run, evaluator)
@@ -136,7 +136,7 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     )
 
 
-def _rank(run: Run[CompressOptions], judges: Evaluators | None, bench: Bench | None) -> Ranking:
+def _rank(run: Run[CompressOptions], judges: Evaluators | None, context: RenderContext | None) -> Ranking:
     """Draw the references, and score every Gaussian unless the cache has the scores."""
     assert run.plan is not None
     scores, reused, cache = None, False, None
@@ -147,13 +147,15 @@ def _rank(run: Run[CompressOptions], judges: Evaluators | None, bench: Bench | N
         scores = cache.load(run.source.count)
         reused = scores is not None
         LOG.info("scores %s %s", "reused from" if reused else "will be kept in", cache.path)
-    if judges is not None and bench is not None:
+    if judges is not None and context is not None:
         with judges.original() as original:
             if run.plan.needs_scores and scores is None:
                 cameras = run.seen.of(run.seen.train)
                 LOG.info("scoring %d Gaussians over %d training poses", run.source.count, len(cameras))
                 with run.clock.stage("score"):
-                    scores = score_scene(bench.renderer, original, run.source, cameras, run.options.score, run.progress)
+                    scores = score_scene(
+                        context.renderer, original, run.source, cameras, run.options.score, run.progress
+                    )
     if cache is not None and scores is not None and not reused:
         cache.save(scores)
     order = np.arange(run.source.count) if scores is None else order_from_scores(scores)

@@ -61,7 +61,7 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
             whole[HELD] = search(studied, path, Promised(studied.target, (WorstView(studied.target.figure, limit),)))
     rows = []
     train = evenly(studied.views.of(studied.views.train), len(cameras))
-    renderer = studied.bench.renderer
+    renderer = studied.context.renderer
     with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in train]
     for name in (*contenders.names, *whole):
@@ -104,7 +104,7 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
 def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
     source = studied.run.source
     judge = QualityEvaluator(
-        studied.bench,
+        studied.context,
         source,
         studied.views,
         studied.judge.indices[::2],
@@ -112,7 +112,7 @@ def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
         studied.run.options.base_psnr,
     )
     try:
-        with studied.bench.renderer.load(source) as original:
+        with studied.context.renderer.load(source) as original:
             judge.prepare(original, studied.run.progress)
         return search(studied, path, studied.target, judge)
     finally:

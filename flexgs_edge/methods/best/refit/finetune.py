@@ -133,7 +133,7 @@ def finetune(
     cameras, course = original.poses, schedule.course
     rates = {**rates_for(cameras, course.means_rate), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    renderer, storage = original.bench.renderer, original.bench.renderer.storage
+    renderer, storage = original.context.renderer, original.context.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
