@@ -18,7 +18,7 @@ from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
-from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
+from flexgs_edge.methods.best.costs import Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
@@ -29,9 +29,9 @@ from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
-DISTILLED, DISTILLED_POWER = 0.46, -0.2
-"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
-the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+DISTILLED = 0.3
+"""Expected loss after a descent, divided by the loss before it, where no descent came between the rounds:
+docs/results/tuning.md#distilled"""
 BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
@@ -91,7 +91,7 @@ class Descents:
     def after(self, excess: float, left: float | None = None) -> float:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
-            return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
+            return excess + math.log(DISTILLED)
         behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
         return (left + excess) / 2 + behind
 
@@ -125,15 +125,11 @@ class GridMaker:
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure
         self.effort, self.refit, self.steps, self.close = effort, refit, steps, effort.close
-        self.selection = Selection(rounds, effort.keep, self.choose, BitModel())
+        self.selection = Selection(rounds, effort.keep, choose, BitModel())
         self._see = see
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
         self._guess, self._left = Guess(measure), 0.0
-
-    def choose(self, costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-        """Rows to keep ([n] bool), and their SH degrees ([n] u8)."""
-        return choose(costs, bits, multiplier)
 
     def start(self, target: Target) -> float:
         """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
