@@ -29,16 +29,15 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
-from flexgs_edge.run.judge import Judge
+from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
+from flexgs_edge.views.render_context import RenderContext
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
 """Step sizes of position, scale, rotation, opacity and constant colour, in fox's units."""
@@ -99,7 +98,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
     backend = open_backend(device, budget)
     source, cameras = scene.source, views.of(views.train)
     renderer = Renderer(backend, budget, near=DEFAULT_NEAR)
-    judge = Judge(Bench(renderer), source, views, views.held_out)
+    judge = QualityEvaluator(RenderContext(renderer), source, views, views.held_out)
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)
@@ -114,7 +113,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
             refitted = refit_colours(
                 start,
                 degrees,
-                Original(Bench(renderer), source.origin, cameras, targets, (), progress),
+                Original(RenderContext(renderer), source.origin, cameras, targets, (), progress),
                 ROUNDS,
                 False,
                 SUBSETS,

@@ -24,8 +24,7 @@ from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
+from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.source import SceneSource

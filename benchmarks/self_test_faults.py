@@ -124,7 +124,7 @@ def forms_of(fault: Fault) -> tuple[str, ...]:
 
 
 def judge_all(chosen: list[Fault], place: Path, workers: int, verbose: bool) -> list[tuple[Fault, str, str]]:
-    """Judge all faults; each worker has a compiler's cache of its own, so that only what changes is built."""
+    """QualityEvaluator all faults; each worker has a compiler's cache of its own, so that only what changes is built."""
 
     def work(share: int) -> list[tuple[Fault, str, str]]:
         found = []

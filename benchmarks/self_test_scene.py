@@ -28,7 +28,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.packed.quantize import quantize_scene
@@ -39,8 +39,8 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
+from flexgs_edge.views.render_context import RenderContext
 
 BLOCKS = 5
 """Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
@@ -249,7 +249,7 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
         # A sampled view, whose window is shorter than the array of its taps: who reads behind it finds no zeros.
         view = camera(66, 60, 0.3, 1.5).every(2)
     drawer = Renderer(backend, budget, antialiased=degree == 2, fit=Fit(pairs=PAIRS))
-    bench = Bench(drawer)
+    bench = RenderContext(drawer)
     with drawer.load(source) as loaded:
         measure_costs(bench, loaded, [view])
         image = drawer.render_planes(loaded, view)

@@ -19,8 +19,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.read import inria_json, read_cameras
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene
+from flexgs_edge.run.inputs import companions_of, load_scene
 from flexgs_edge.scene.source import SceneSource
 
 CHUNK_ROWS = 16384

@@ -19,7 +19,7 @@ from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.methods.best.refit.distil import LONG, STRUCTURE, rates_for
+from flexgs_edge.methods.best.refit.finetune import LONG, STRUCTURE, rates_for
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics

@@ -195,7 +195,9 @@ Several scenes:
 )
 @option(
     METHOD,
+    "--finetune",
     "--distil",
+    "distil",
     metavar="STEPS",
     type=int,
     help="Fine-tune all remaining Gaussians against renders of the original, one view a step. Needs no photos; .fgs only. "

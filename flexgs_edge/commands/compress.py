@@ -19,17 +19,17 @@ from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.doubts import doubts
 from flexgs_edge.run.inputs import ScenePlace, scene_info
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.live import live_scenes
-from flexgs_edge.run.made import Made
-from flexgs_edge.run.open_bench import bench_info, open_bench
+from flexgs_edge.run.method_result import MethodResult
+from flexgs_edge.run.open_context import context_info, open_context
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.run.warnings import view_warnings
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -56,15 +56,15 @@ def compress(
     run = open_compression(input, output, options, progress, given)
     method = paper if options.method == "paper" else best if run.output.format is None else foreign
     with ExitStack() as stack:
-        bench = None
+        context = None
         if run.views is None:
             run.budget.require("the scene", 0)
         else:
             needed = partial(method.expected_bytes, run)
-            bench = stack.enter_context(open_bench(run, options.cluster, needed))
-            run = check_views(run, bench, options.trust_views)
-        made = method.compress(run, bench)
-        result = _result(run, bench, made)
+            context = stack.enter_context(open_context(run, options.cluster, needed))
+            run = check_views(run, context, options.trust_views)
+        made = method.compress(run, context)
+        result = _result(run, context, made)
     if run.output.path is not None and run.output.format is not None and run.output.offset is not None:
         LOG.info(write_offset(run.output.path, run.output.offset, run.output.format, options.force))
     if run.reporter is not None:
@@ -81,7 +81,7 @@ def _show_live(run: Run[CompressOptions], path: Path) -> None:
             run.reporter.show_live(lambda first: live_scenes(run, path, first))
 
 
-def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> CompressResult:
+def _result(run: Run[CompressOptions], context: RenderContext | None, made: MethodResult) -> CompressResult:
     """The record of a run; its warnings are logged."""
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None
@@ -89,9 +89,9 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
     held_out = None
     if made.quality is not None and made.trained is not None:
         held_out = measurement_of(made.quality).figure("fidelity")
-    warnings = doubts(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
+    warnings = view_warnings(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
     reached = search.reached if search and options.fixed is None else None
-    warnings += _default_doubts(run, reached, search)
+    warnings += _default_warnings(run, reached, search)
     promise = kept_promise(plan.target, made.size, search.chosen.measurement) if search else None
     for warning in warnings:
         LOG.warning("warning: %s", warning)
@@ -121,17 +121,17 @@ def _result(run: Run[CompressOptions], bench: Bench | None, made: Made) -> Compr
         quality_views=plan.kind_of(plan.report, views),
         score_cache=options.score_cache if plan.needs_scores else None,
         scores_reused=made.scores_reused,
-        run=bench_info(run, bench),
+        run=context_info(run, context),
         format=run.output.format.suffix[1:] if run.output.format else "fgs",
         file_sh_degree=made.sh_degree,
         preview_bytes=made.preview_bytes,
         scored=scored,
         training_fidelity=made.trained,
-        warnings=(*run.doubts, *warnings),
+        warnings=(*run.warnings, *warnings),
     )
 
 
-def _default_doubts(run: Run[CompressOptions], reached: bool | None, search: SearchResult | None) -> tuple[str, ...]:
+def _default_warnings(run: Run[CompressOptions], reached: bool | None, search: SearchResult | None) -> tuple[str, ...]:
     """Warn if the default target was missed, or if a size leaves no room for the promise."""
     format, plan = run.output.format, run.plan
     if plan is None or plan.target is None or search is None:

@@ -16,9 +16,9 @@ from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import bench_info, open_bench
+from flexgs_edge.run.open_context import context_info, open_context
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
@@ -55,8 +55,8 @@ def evaluate(
         return drawing_bytes(run) + decode_bytes(run.source, None) + decode_bytes(scene.source, None)
 
     with ExitStack() as stack:
-        bench = stack.enter_context(open_bench(run, needed=needed))
-        run, renderer = check_views(run, bench, trusted=True), bench.renderer
+        context = stack.enter_context(open_context(run, needed=needed))
+        run, renderer = check_views(run, context, trusted=True), context.renderer
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing
             with clock.stage("lpips"):
@@ -65,7 +65,7 @@ def evaluate(
         with clock.stage("load"):
             spare = drawing_bytes(run) + decode_bytes(scene.source, None)
             original_source = read_often(run.source, budget, spare, renderer.backend)
-        judge = Judge(bench, original_source, views, indices, base_psnr=base_psnr)
+        judge = QualityEvaluator(context, original_source, views, indices, base_psnr=base_psnr)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(original_source) as original:
             judge.prepare(original, progress)
@@ -81,8 +81,8 @@ def evaluate(
             views=views_info(views),
             quality=quality,
             quality_views="held-out" if views.held_out else "training",
-            run=bench_info(run, bench),
-            warnings=run.doubts,
+            run=context_info(run, context),
+            warnings=run.warnings,
         )
     if reporter is not None:
         reporter.read_contents(input)

@@ -29,7 +29,7 @@ def info(path: str | os.PathLike[str]) -> InfoResult:
 
 def _scene_info(path: Path) -> InfoResult:
     # Imported here because they load cameras, options and other formats, which a .fgs does not need.
-    from flexgs_edge.run.companions import companions_of
+    from flexgs_edge.run.inputs import companions_of
 
     opened = open_file(path)
     source, beside = opened.source, companions_of(path)

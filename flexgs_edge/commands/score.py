@@ -11,14 +11,13 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
-from flexgs_edge.methods.paper.score_cache import score_cache
-from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_scene
+from flexgs_edge.methods.paper.scores import SCORE_ROW_BYTES, SCORES, score_cache, score_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ScoreResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_bench import bench_info, open_bench
+from flexgs_edge.run.open_context import context_info, open_context
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
@@ -54,8 +53,8 @@ def score_gaussians(
     def needed() -> int:
         return sums + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    with open_bench(run, needed=needed, compares=False) as bench:
-        renderer = bench.renderer
+    with open_context(run, needed=needed, compares=False) as context:
+        renderer = context.renderer
         run.budget.take("scores", sums)
         with clock.stage("load"):
             source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
@@ -70,5 +69,5 @@ def score_gaussians(
             score=score,
             scored_views=len(views.train),
             unseen=int(np.isneginf(scores).sum()),
-            run=bench_info(run, bench),
+            run=context_info(run, context),
         )

@@ -19,7 +19,7 @@ import numpy as np
 from flexgs_edge.codec.open_fgs import file_version, read_header
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.header import Header
-from flexgs_edge.codec.v2.boxes import BOXES
+from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable

@@ -11,9 +11,8 @@ from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS, Planes, StepSizes
-from flexgs_edge.memory.ordered import OrderedPlanes, stable_order
 from flexgs_edge.memory.rows import blocks, put_rows, read_ahead, read_rows
-from flexgs_edge.memory.storage import IN_MEMORY, Storage
+from flexgs_edge.memory.storage import IN_MEMORY, OrderedPlanes, Storage, stable_order
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.rotations import canonical_axes

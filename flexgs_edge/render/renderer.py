@@ -19,8 +19,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.render import fit as fit_module
-from flexgs_edge.render.ahead import ViewsAhead
-from flexgs_edge.render.camera_record import camera_record
+from flexgs_edge.render.ahead import ViewsAhead, camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, GROWTH, GUESS, MOST_SUMS, SUM_BYTES, Fit, fits_whole, saves_bytes

@@ -14,11 +14,10 @@ from flexgs_edge.goals.steps import Step
 from flexgs_edge.goals.target import Target
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.report.html import count, figure, render
-from flexgs_edge.report.material import Material, Rig
+from flexgs_edge.report.material import ERROR_SCALE, FLIP_SCALE, Material, Rig, css_ramp
 from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_words
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.summary import device_words, memory_words
-from flexgs_edge.report.tones import ERROR_SCALE, FLIP_SCALE, css_ramp
 from flexgs_edge.units import format_size, times_words
 
 SIDE = 360  # Width of a plan in its own units: as wide as a phone, like the charts

@@ -66,7 +66,7 @@ class Series:
 class LineChart:
     """Curves over a common axis.
 
-    `log_x`: use a plain log scale, such as for times. All values must be above zero.
+    `log_x`, `log_y`: use a plain log scale, such as for times. All values must be above zero.
     """
 
     title: str
@@ -80,6 +80,7 @@ class LineChart:
     megabytes: bool = False  # show x in MB, on a log scale
     floating: bool = False  # y need not start at zero, such as for fidelity
     log_x: bool = False
+    log_y: bool = False
     # Pareto front: points that no other point beats, joined by steps under the series.
     front: Sequence[tuple[float, float]] = ()
 
@@ -236,7 +237,12 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-    if not chart.floating:
+    if chart.log_y:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+    elif not chart.floating:
         axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))

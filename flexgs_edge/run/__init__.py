@@ -1,1 +1,1 @@
-"""Code that all commands share: options, inputs, the plan, the bench, the judges."""
+"""Code that all commands share: options, inputs, the plan, the render context, the evaluators."""

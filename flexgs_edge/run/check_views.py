@@ -23,11 +23,11 @@ from flexgs_edge.quality.psnr import mse, psnr
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import Options
-from flexgs_edge.run.judge import work_bytes
 from flexgs_edge.run.options import AUTO_CAMERAS
+from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -63,14 +63,14 @@ class _Compared:
         return [math.nan if a is None and b is None else likeness(a, b) for a, b in pairs]
 
 
-def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
+def check_views(run: Run[Options], context: RenderContext, trusted: bool) -> Run[Options]:
     """Compare some views with their photos (stage `check views`).
 
     Parameters
     ----------
     run : Run
         With views.
-    bench : Bench
+    context : RenderContext
         Draws; nothing is loaded afterwards.
     trusted : bool
         Warn of views that do not belong to the scene, and go on.
@@ -78,7 +78,7 @@ def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
     Returns
     -------
     Run
-        With the warnings among its doubts.
+        With the words among its warnings.
 
     Raises
     ------
@@ -89,14 +89,14 @@ def check_views(run: Run[Options], bench: Bench, trusted: bool) -> Run[Options]:
     if views.cameras_from == AUTO_CAMERAS:
         return run
     with run.clock.stage("check views"):
-        found = _find_fault(run, bench.renderer, views)
+        found = _find_fault(run, context.renderer, views)
     if found is None:
         return run
     words, fatal = found
     if fatal and not trusted:
         raise InputError(f"{views.cameras_from}: {words} --trust-views goes on all the same.")
     LOG.warning("warning: %s", words)
-    return replace(run, doubts=(*run.doubts, words))
+    return replace(run, warnings=(*run.warnings, words))
 
 
 def _find_fault(run: Run[Options], renderer: Renderer, views: ViewSet) -> tuple[str, bool] | None:

@@ -13,9 +13,9 @@ from flexgs_edge.io.codes import opacities
 from flexgs_edge.io.exchange import MovedSource, written_order
 from flexgs_edge.report.file_results import ConversionLoss
 from flexgs_edge.run.inputs import CheckedScene, load_scene
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import open_run
 from flexgs_edge.scene.source import SceneSource
 
@@ -63,11 +63,11 @@ def conversion_loss(
     try:
         run = open_run(scene, replace(options, holdout=0, resolution=WIDTH, images="none"), photos=False)
         chosen = run.seen.train[:: -(-len(run.seen.train) // VIEWS)]
-        with open_bench(run) as bench:
-            judge = Judge(bench, run.source, run.seen, chosen)
-            with bench.renderer.load(run.source) as original:
+        with open_context(run) as context:
+            judge = QualityEvaluator(context, run.source, run.seen, chosen)
+            with context.renderer.load(run.source) as original:
                 judge.prepare(original)
-            with bench.renderer.load(written.source) as drawn:
+            with context.renderer.load(written.source) as drawn:
                 quality = judge.compare(drawn)
             judge.close()
     except (BudgetError, DeviceError, InputError) as error:

@@ -10,7 +10,7 @@ from flexgs_edge.cameras.order import in_picture
 from flexgs_edge.memory.process import return_freed_memory
 from flexgs_edge.render.fit import DEFAULT, GUESS, ViewSize, compact_bytes, padded, streamed_bytes, view_bytes
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
-from flexgs_edge.run.judge import work_bytes
+from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import some_positions
 

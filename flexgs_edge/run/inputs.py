@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from flexgs_edge.cameras.nerfstudio import dataparser_above
+from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RDF, Frame
-from flexgs_edge.io.model_folder import Companions
+from flexgs_edge.io.model_folder import Companions, find_companions
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.report.run_info import SceneInfo
@@ -21,6 +23,34 @@ from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
+
+
+def companions_of(path: str | os.PathLike[str]) -> Companions:
+    """Find cameras, photos and drawing settings beside the scene at `path`, and log the cameras and photos found."""
+    found = find_companions(path)
+    if found.cameras is None:
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        found = replace(found, cameras=find_cameras(folder))
+        if found.images is None and found.cameras == folder / NERF_SYNTHETIC and (folder / "train").is_dir():
+            found = replace(found, images=folder / "train")
+    found = replace(found, dataparser=dataparser_above(Path(path)))
+    for what, place in (("cameras", found.cameras), ("photos", found.images)):
+        if place is not None:
+            LOG.info("found %s beside the scene: %s", what, place)
+    return found
+
+
+def merge_companions(first: Companions, second: Companions) -> Companions:
+    """Combine the companions of two scenes.
+
+    Cameras and photos both come from `first` if it has cameras, else from `second`: photos of another place would not match.
+    Background and antialiasing come from whichever scene states them, `first` before `second`.
+    """
+    chosen = first if first.cameras is not None else second
+    white = first.white_background if first.white_background is not None else second.white_background
+    antialiased = first.antialiased if first.antialiased is not None else second.antialiased
+    return Companions(chosen.cameras, chosen.images, white, antialiased, chosen.dataparser)
+
 
 Options = TypeVar("Options", bound=ViewOptions)
 

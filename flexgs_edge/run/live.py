@@ -10,8 +10,7 @@ import numpy as np
 
 from flexgs_edge.codec.open_fgs import file_version
 from flexgs_edge.codec.v2.container import write_grid
-from flexgs_edge.grid.position_grid import position_grid
-from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.step_sizes import StepSizes, position_grid
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.report.material import Live
 from flexgs_edge.run.inputs import Options

@@ -40,7 +40,7 @@ EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
 NONE = "none"  # Lifts a bound of the promise
 LAYERS_MOST = 4
-DISTIL_MOST = 100_000
+FINETUNE_MOST = 100_000
 """Most iterations of distillation. This many take hours on any machine; beyond a few thousand nothing is gained."""
 DEFAULT_MAX_DROP = 1.0
 METHOD_ONLY: dict[str, tuple[str, object]] = {
@@ -188,8 +188,8 @@ class CompressOptions(ViewOptions):
         if not self.refit and (self.distil or (self.effort == "max" and self.distil is None)):
             word = f"--distil {self.distil}" if self.distil else "--effort max"
             raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")
-        if self.distil is not None and not 0 <= self.distil <= DISTIL_MOST:
-            raise InputError(f"--distil {self.distil}: expected 0 (none) to {DISTIL_MOST} steps")
+        if self.distil is not None and not 0 <= self.distil <= FINETUNE_MOST:
+            raise InputError(f"--distil {self.distil}: expected 0 (none) to {FINETUNE_MOST} steps")
         if self.layers is not None and not 1 <= self.layers <= LAYERS_MOST:
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.preview is not None and not 0 <= self.preview <= PREVIEW_MOST:

@@ -22,15 +22,14 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.material import Live, Material, Rig, Shot
+from flexgs_edge.report.material import FLIP_SCALE, Live, Material, Rig, Shot, error_map, ramp
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
-from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.inputs import CheckedScene
-from flexgs_edge.run.judge import Judge
 from flexgs_edge.run.open_scene import is_fgs
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
 
@@ -69,7 +68,9 @@ def chosen_ranks(count: int) -> list[int]:
     return [i * (count - 1) // max(most - 1, 1) for i in range(most)]
 
 
-def draw_shots(judge: Judge, scene: DeviceScene, quality: Quality, progress: Progress = SILENT) -> tuple[Shot, ...]:
+def draw_shots(
+    judge: QualityEvaluator, scene: DeviceScene, quality: Quality, progress: Progress = SILENT
+) -> tuple[Shot, ...]:
     """Draw and encode the pictures of some views, the worst view first."""
     order = quality.by_loss
     ranks = chosen_ranks(len(order))
@@ -184,7 +185,12 @@ class Reporter:
         budget.take("pictures of the report", shots_bytes(views.of(views.held_out or views.train)))
 
     def look(
-        self, judge: Judge, scene: DeviceScene, quality: Quality, clock: Stopwatch, progress: Progress = SILENT
+        self,
+        judge: QualityEvaluator,
+        scene: DeviceScene,
+        quality: Quality,
+        clock: Stopwatch,
+        progress: Progress = SILENT,
     ) -> None:
         """Draw the pictures of a decoded scene whose quality `judge` has just measured."""
         with clock.stage("pictures"):

@@ -15,15 +15,23 @@ from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of, merge_companions
-from flexgs_edge.run.doubts import frame_doubts
-from flexgs_edge.run.inputs import LOG, CheckedScene, Options, ScenePlace, load_scene, resolve_drawing
+from flexgs_edge.run.inputs import (
+    LOG,
+    CheckedScene,
+    Options,
+    ScenePlace,
+    companions_of,
+    load_scene,
+    merge_companions,
+    resolve_drawing,
+)
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views, near_enough
+from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import SceneSource
 
 
@@ -41,7 +49,7 @@ class Run(Generic[Options]):
     reporter: Reporter | None = None  # gathers the pages of `--report`
     output: Output = NO_OUTPUT  # the file that `compress` writes
     judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
-    doubts: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
+    warnings: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
 
     @property
     def source(self) -> SceneSource:
@@ -106,10 +114,10 @@ def open_run(
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
         unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
-        found = () if views is None or unread else frame_doubts(views, scene)
+        found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
-    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, doubts=found)
+    return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, warnings=found)
 
 
 def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:
@@ -155,7 +163,7 @@ def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:
     warnings = check_positions(run.source, format, run.options.force_lossy)
     for warning in warnings:
         LOG.warning("warning: %s", warning)
-    return replace(run, doubts=(*run.doubts, *warnings))
+    return replace(run, warnings=(*run.warnings, *warnings))
 
 
 def _beside(place: ScenePlace) -> Companions:

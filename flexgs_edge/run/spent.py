@@ -13,7 +13,7 @@ from flexgs_edge.run.clock import Stopwatch
 def run_info(
     budget: MemoryBudget, clock: Stopwatch, backend: Backend | None = None, storage: Storage = IN_MEMORY
 ) -> RunInfo:
-    """Record seconds, memory and device of a run that has no bench."""
+    """Record seconds, memory and device of a run that has no context."""
     return RunInfo(
         seconds=clock.total,
         stages=dict(clock.stages),

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexgs_edge.memory.ordered import stable_order
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
-from flexgs_edge.memory.storage import IN_MEMORY, Storage
+from flexgs_edge.memory.storage import IN_MEMORY, Storage, stable_order
 
 
 def morton(cells: np.ndarray) -> np.ndarray:

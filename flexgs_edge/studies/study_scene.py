@@ -22,14 +22,14 @@ from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.studies.result_tables import Cell
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -62,12 +62,19 @@ class StudyScene:
         self,
         name: str,  # name of the scene, for tables and folders
         run: Run[CompressOptions],  # As for `compress`. The plan's views and figure decide here too.
-        bench: Bench,  # draws the views
-        judge: Judge,  # prepared, with the original's renders
+        context: RenderContext,  # draws the views
+        judge: QualityEvaluator,  # prepared, with the original's renders
         orders: dict[str, np.ndarray],  # [N] i64 by name of the score: rows, least important first
         has_sh: np.ndarray,  # [N] bool, rows with SH that are not zero
     ) -> None:
-        self.name, self.run, self.bench, self.judge, self.orders, self.has_sh = name, run, bench, judge, orders, has_sh
+        self.name, self.run, self.context, self.judge, self.orders, self.has_sh = (
+            name,
+            run,
+            context,
+            judge,
+            orders,
+            has_sh,
+        )
         self._evaluators: dict[str, SceneEvaluator] = {}
         self._points: dict[Setting, Point] = {}
         self._search: SearchResult | None = None
@@ -205,10 +212,12 @@ def open_study_scene(
     with clock.stage("open"):
         has_sh = nonzero_sh(source)
     with ExitStack() as stack:
-        bench = stack.enter_context(open_bench(run))
-        renderer = bench.renderer
+        context = stack.enter_context(open_context(run))
+        renderer = context.renderer
         run.budget.take("ranks", RANK_BYTES * source.count * len(scores))
-        judge = Judge(bench, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr)
+        judge = QualityEvaluator(
+            context, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr
+        )
         stack.callback(judge.close)
         with clock.stage("load"):
             original = renderer.load(source)
@@ -223,7 +232,7 @@ def open_study_scene(
                     found = score_scene(renderer, original, source, cameras, score, progress)
                     orders[score] = order_from_scores(found)
         renderer.release()
-        yield StudyScene(name, run, bench, judge, orders, has_sh)
+        yield StudyScene(name, run, context, judge, orders, has_sh)
 
 
 def scene_names(paths: Sequence[str | Path]) -> list[str]:

@@ -15,10 +15,9 @@ from flexgs_edge.report.plots import picture, require_matplotlib
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, fields_json, record
 from flexgs_edge.report.summary import device_words
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_bench import bench_info
+from flexgs_edge.run.open_context import context_info
 from flexgs_edge.run.view_set import views_info
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import json_bytes
+from flexgs_edge.studies.result_tables import Experiment, json_bytes
 from flexgs_edge.studies.study_scene import StudyScene
 
 LOG = logging.getLogger("flexgs_edge")
@@ -53,7 +52,7 @@ class SceneStudy:
             views_info(studied.views),
             studied.decided_by,
             tuple(experiments),
-            bench_info(studied.run, studied.bench),
+            context_info(studied.run, studied.context),
         )
 
     def to_json(self) -> dict[str, Any]:

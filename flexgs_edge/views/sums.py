@@ -22,8 +22,8 @@ from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.one_view import Drawn, Part, view_parts, view_sums
+from flexgs_edge.views.render_context import RenderContext
 
 
 class DenseSums:
@@ -148,11 +148,11 @@ Maker = Callable[[Chunk], ChunkSums]
 class ViewSums:
     """Sums over the views of a scene.
 
-    `bench`: draws the views. `makers`: each makes one kind of sums for a chunk.
+    `context`: draws the views. `makers`: each makes one kind of sums for a chunk.
     """
 
-    def __init__(self, bench: Bench, scene: DeviceScene, makers: Sequence[Maker]) -> None:
-        self._bench, self._renderer, self._scene, self._makers = bench, bench.renderer, scene, makers
+    def __init__(self, context: RenderContext, scene: DeviceScene, makers: Sequence[Maker]) -> None:
+        self._context, self._renderer, self._scene, self._makers = context, context.renderer, scene, makers
         scene.keep_chunks()
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
         self._spool: Spool | None = None
@@ -170,7 +170,7 @@ class ViewSums:
         `references`: gives the target of a view by its place among `cameras`, if that method takes one. Yields gives
         the view's picture for `References.add`; valid until the next step.
         """
-        renderer, scene, cluster = self._renderer, self._scene, self._bench.ready_cluster
+        renderer, scene, cluster = self._renderer, self._scene, self._context.ready_cluster
         if cluster is None or scene.source is None:
             for view, camera in enumerate(renderer.in_turn(scene, cameras)):
                 self.add_view(view_sums(renderer, scene, kind, camera, references and references(view)), camera)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.nearness import nearest, squared_distances
+from flexgs_edge.cameras.order import nearest, squared_distances
 from synthetic import make_camera
 
 BACK = np.diag([-1.0, 1.0, -1.0])

@@ -14,7 +14,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import companions_of
 from synthetic import look_from, make_camera
 
 SHIFT = {"transform": [[1.0, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}

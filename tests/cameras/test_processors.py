@@ -15,7 +15,7 @@ import pytest
 from flexgs_edge.cameras.generated import at_distance, poses_between
 from flexgs_edge.cameras.order import covering_order
 from flexgs_edge.cameras.read import read_inria
-from flexgs_edge.render.camera_record import camera_record
+from flexgs_edge.render.ahead import camera_record
 
 PROCESSORS = {
     "Prescott": {"OPENBLAS_CORETYPE": "Prescott", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX2 FMA3 AVX512F"},

@@ -18,9 +18,9 @@ from flexgs_edge.cli import app
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RUB, FrameSource
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.run.doubts import frame_doubts
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.run.warnings import frame_warnings
 from synthetic import make_camera
 from tiny_project import COUNT, make_project
 
@@ -189,16 +189,16 @@ def test_a_scene_behind_its_cameras(project: Path) -> None:
     """One that looks along z sees the scene, whose middle is (0, 0, 4); turned by mistake, all of it lies behind."""
     ahead, back = make_camera(), make_camera(rotation=np.diag([1.0, -1.0, -1.0]))
     wrong = replace(load_scene(project / "rub.ply"), frame=RUB)
-    (words,) = frame_doubts(views(ahead), wrong)
+    (words,) = frame_warnings(views(ahead), wrong)
     assert words.startswith("100 % of the Gaussians lie behind all 1 cameras of cameras.json")
     assert "read as RUB" in words and "--frame RDF" in words
-    assert frame_doubts(views(ahead, back), wrong) == ()
+    assert frame_warnings(views(ahead, back), wrong) == ()
     assert "lie behind" not in " ".join(
-        frame_doubts(views(ahead), replace(wrong, frame=load_scene(project / "rub.ply").frame))
+        frame_warnings(views(ahead), replace(wrong, frame=load_scene(project / "rub.ply").frame))
     )
-    assert frame_doubts(replace(views(ahead), cameras_from="auto"), wrong) == ()
+    assert frame_warnings(replace(views(ahead), cameras_from="auto"), wrong) == ()
     right = load_scene(project / "point_cloud.ply")
-    assert frame_doubts(views(ahead), replace(right, frame=RUB)) == ()
+    assert frame_warnings(views(ahead), replace(right, frame=RUB)) == ()
 
 
 def test_the_doubt_is_told(project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,8 +24,8 @@ from flexgs_edge.goals.steps import Choice, Step, better
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
 from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import measurement_of
 
 PARTS = (WorstView("drop", 1.7), MeanSsim(0.015), MadePoses())
 GOOD = Measurement(0.8, 40.0, 0.8, Measurement(1.3, 38.0, 1.2), usual=0.8, ssim_drop=0.01, made_gap=1.0)

@@ -18,8 +18,7 @@ from flexgs_edge.codec.v1.packed_source import QuantizedSource
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.position_grid import position_grid
-from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.step_sizes import StepSizes, position_grid
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.packed.bitspec import BitSpec

@@ -39,7 +39,7 @@ class FakeRounds:
         sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
         costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
         self.original = SimpleNamespace(
-            origin=np.zeros(3), cameras=range(10), bench=SimpleNamespace(renderer=None), turns=None
+            origin=np.zeros(3), cameras=range(10), context=SimpleNamespace(renderer=None), turns=None
         )
         self.snapshots = [Snapshot(np.arange(count), planes, costs)]
         self.shares: list[float] = []

@@ -158,7 +158,7 @@ def test_a_test_that_does_not_end(info: DeviceInfo, monkeypatch: pytest.MonkeyPa
 
 def test_wrong_devices_are_passed_over(monkeypatch: pytest.MonkeyPatch, info: DeviceInfo) -> None:
     """The next one is tested and taken, unless the user named the one that fails."""
-    gpu = replace(info, index=1, name="Made up", type="gpu")
+    gpu = replace(info, index=1, name="MethodResult up", type="gpu")
     monkeypatch.setattr(module, "list_devices", lambda self_test: [info, gpu])
     bad = says({"self_test": "kernel x computes 1", "loop_steps": 0, "form": ""})
     code = f"import sys\nif sys.argv[1] == '1': {bad}\nelse: {says(GOOD)}"

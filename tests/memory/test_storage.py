@@ -16,9 +16,8 @@ import pytest
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.memory import rows as memory_rows
 from flexgs_edge.memory import storage as storage_module
-from flexgs_edge.memory.ordered import stable_order
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
-from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage, file_system_of
+from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage, file_system_of, stable_order
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.costs import lowest
 

@@ -13,7 +13,7 @@ from flexgs_edge.quality.psnr import modelled_drop, mse
 from flexgs_edge.quality.view_quality import LEAST_COVERAGE, Quality, ViewQuality, compare_view
 from flexgs_edge.report.as_json import quality_json
 from flexgs_edge.report.summary import quality_lines
-from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.quality_evaluator import measurement_of
 
 SMALL = Quality((ViewQuality("a", 1e-5, coverage=0.01), ViewQuality("b", 4e-5, coverage=0.02)), 34.0, True)
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexgs_edge.quality.exposure import exposure_gains, with_gains
-from flexgs_edge.quality.psnr import contrast, drop, far_bases, mse, mse_of_psnr
+from flexgs_edge.quality.psnr import contrast, drop, exposure_gains, far_bases, mse, mse_of_psnr, with_gains
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
-from flexgs_edge.run.judge import measurement_of
+from flexgs_edge.run.quality_evaluator import measurement_of
 
 RNG = np.random.default_rng(63)
 STOPS = np.array([-1.0, -0.4, 0.7])

@@ -15,8 +15,8 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
+from flexgs_edge.views.render_context import RenderContext
 from flexgs_edge.views.sums import ViewSums
 from kernel_fixtures import FORMS, PairedBackend, large_budget, launch, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -58,7 +58,7 @@ def everything(form: str, extent: str, antialiased: bool, blocks: bool) -> tuple
             assert renderer.parts is not None
             counts.append(sum(part.count for part in renderer.parts.values()))
             found.append(renderer.read_sums(renderer.removal_sums(scene, camera), 2, ROWS))
-        sums = ViewSums(Bench(renderer), scene, [cost_sums(renderer, 2)])
+        sums = ViewSums(RenderContext(renderer), scene, [cost_sums(renderer, 2)])
         assert len(list(sums.draw("removal_sums", views()))) == 4
         parts = cost_parts(2, ROWS, renderer.storage)
         for rows, (costs,) in sums.parts():
@@ -68,7 +68,7 @@ def everything(form: str, extent: str, antialiased: bool, blocks: bool) -> tuple
         references = [renderer.render_planes(scene, camera).astype(np.float16) for camera in views()]
     planes = source.read(slice(0, ROWS), list(FIELD))
     planes = {name: values + np.float32(0.1) if name.startswith("sh") else values for name, values in planes.items()}
-    original = Original(Bench(renderer), np.zeros(3), views(), references)  # type: ignore[arg-type]
+    original = Original(RenderContext(renderer), np.zeros(3), views(), references)  # type: ignore[arg-type]
     moved = refit_colours(planes, np.full(ROWS, 2), original, rounds=1)
     renderer.release()
     return [*found, statistics.hits, statistics.weights, moved["sh_dc"], moved["sh_rest"]], counts
@@ -102,7 +102,7 @@ def test_parts_of_views_on_kernels_and_twins(form: str, monkeypatch: pytest.Monk
     paired = PairedBackend(open_form(form), 2)
     renderer = Renderer(paired, large_budget())
     with renderer.load(wide_scene()) as scene:
-        sums = ViewSums(Bench(renderer), scene, [cost_sums(renderer, 2)])
+        sums = ViewSums(RenderContext(renderer), scene, [cost_sums(renderer, 2)])
         assert len(list(sums.draw("removal_sums", views()[:2]))) == 2
         assert renderer.parts is not None
         assert 0 < sum(part.count for part in renderer.parts.values()) < ROWS

@@ -9,9 +9,8 @@ import pytest
 
 from flexgs_edge.goals.steps import Choice, Step
 from flexgs_edge.goals.target import MaxDrop, Measurement
-from flexgs_edge.report.material import Rig
+from flexgs_edge.report.material import ERROR_SCALE, Rig, error_map, ramp
 from flexgs_edge.report.pages import nice_range, plans, step_chart
-from flexgs_edge.report.tones import ERROR_SCALE, error_map, ramp
 from page_parser import Page
 
 

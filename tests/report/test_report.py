@@ -25,13 +25,12 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.quality.flip import flip_maps
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.report.material import Material, Rig, Shot
+from flexgs_edge.report.material import FLIP_SCALE, Material, Rig, Shot, error_map, ramp
 from flexgs_edge.report.pages import compress_page, evaluate_page, step_chart
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.report.tones import FLIP_SCALE, error_map, ramp
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import companions_of
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.reporter import Reporter, encode
 from page_parser import Page

@@ -17,16 +17,16 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import InputError
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.doubts import frame_doubts
-from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import CompressOptions, ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import GivenViews
+from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 WIDTH = 120
-Opened = tuple[Run[ViewOptions], Bench]
+Opened = tuple[Run[ViewOptions], RenderContext]
 Load = Callable[[int], np.ndarray]
 
 
@@ -41,7 +41,7 @@ class MadePhotos:
 def opened(sample_dir: Path) -> Iterator[Opened]:
     """The bundled scene with small views."""
     run = open_run(sample_dir / "point_cloud.ply", ViewOptions(resolution=WIDTH))
-    with open_bench(run) as bench:
+    with open_context(run) as bench:
         yield run, bench
 
 
@@ -53,7 +53,7 @@ def checked(
     views = run.seen
     photos: Any = views.photos if load is None else MadePhotos(load)
     changed = replace(run, views=replace(views, cameras=cameras or views.cameras, photos=photos))
-    return check_views(changed, bench, trusted).doubts
+    return check_views(changed, bench, trusted).warnings
 
 
 def photo(opened: Opened, index: int) -> np.ndarray:
@@ -148,9 +148,9 @@ def test_views_that_see_nothing_are_warned_of_without_photos(opened: Opened) -> 
     away = [replace(c, rotation=np.diag([-1.0, 1.0, -1.0]) @ c.rotation) for c in run.seen.cameras]
     far = [replace(c, translation=np.diag([-1.0, 1.0, -1.0]) @ c.translation + [0, 0, -1e6]) for c in away]
     blind = replace(run, views=replace(run.seen, cameras=far, photos=None))
-    assert frame_doubts(run.seen, run.scene) == ()
-    assert "nothing of the scene in sight" in frame_doubts(blind.seen, run.scene)[0]
-    (words,) = check_views(blind, bench, trusted=False).doubts
+    assert frame_warnings(run.seen, run.scene) == ()
+    assert "nothing of the scene in sight" in frame_warnings(blind.seen, run.scene)[0]
+    (words,) = check_views(blind, bench, trusted=False).warnings
     assert "15 of 15 compared views show nothing but one colour" in words
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from camera_files import colmap_records, write_colmap, write_transforms
-from flexgs_edge.run.companions import companions_of
+from flexgs_edge.run.inputs import companions_of
 from synthetic import make_camera
 
 

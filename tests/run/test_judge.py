@@ -14,20 +14,19 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.companions import companions_of
-from flexgs_edge.run.inputs import load_scene, resolve_drawing
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.open_bench import open_bench
+from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
+from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 from tiny_project import COUNT, make_project
 
 VIEWS = [0, 3, 8]
-Judged = tuple[Judge, SceneSource, Renderer, MemoryBudget]
+Judged = tuple[QualityEvaluator, SceneSource, Renderer, MemoryBudget]
 MakeJudge = Callable[..., AbstractContextManager[Judged]]
 
 
@@ -43,9 +42,9 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> MakeJudge:
     @contextmanager
     def open_judge(**words: bool) -> Iterator[Judged]:
         budget = MemoryBudget(2**28)
-        with open_bench(Run(options, scene, views, None, budget, Stopwatch())) as bench:
+        with open_context(Run(options, scene, views, None, budget, Stopwatch())) as bench:
             before = budget.used
-            judge = Judge(bench, scene.source, views, VIEWS, **words)
+            judge = QualityEvaluator(bench, scene.source, views, VIEWS, **words)
             with bench.renderer.load(scene.source) as loaded:
                 judge.prepare(loaded)
             yield judge, scene.source, bench.renderer, budget
@@ -60,7 +59,7 @@ def half_of(source: SceneSource) -> dict[str, np.ndarray]:
     return source.select(np.arange(0, COUNT, 2)).read(slice(0, COUNT // 2), list(FIELD))
 
 
-class CountingBench(Bench):
+class CountingBench(RenderContext):
     """Counts how often a scene's views are drawn."""
 
     drawn = 0
@@ -70,10 +69,10 @@ class CountingBench(Bench):
         return super().images(scene, cameras)
 
 
-def counting(judge: Judge) -> CountingBench:
+def counting(judge: QualityEvaluator) -> CountingBench:
     """The judge's bench from now on, which counts."""
-    judge.bench = CountingBench(judge.bench.renderer, judge.bench.cluster)
-    return judge.bench
+    judge.context = CountingBench(judge.context.renderer, judge.context.cluster)
+    return judge.context
 
 
 class Workers:
@@ -95,7 +94,7 @@ class Workers:
 def test_references_that_do_not_fit_are_drawn_again(judged: MakeJudge, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for share in (4, 10**9):
-        monkeypatch.setattr("flexgs_edge.run.judge.SHARE", share)
+        monkeypatch.setattr("flexgs_edge.run.quality_evaluator.SHARE", share)
         with judged() as (judge, source, renderer, _):
             with renderer.load(source.select(np.arange(0, COUNT, 2))) as loaded:
                 found.append(judge.compare(loaded))
@@ -148,7 +147,7 @@ def test_scenes_that_are_not_on_the_backend_are_known_again(
         use_fit(monkeypatch, whole_views=False)
     with judged(reports=True) as (judge, source, renderer, _):
         if elsewhere:
-            judge.bench.cluster = Workers(renderer)  # type: ignore[assignment]
+            judge.context.cluster = Workers(renderer)  # type: ignore[assignment]
         bench, planes = counting(judge), half_of(source)
 
         def compare(planes: dict[str, np.ndarray]) -> object:

@@ -99,7 +99,7 @@ def test_another_format_holds_the_whole_scene(
     assert row["kept"] == COUNT
     # Rows in another order than the study's: other bytes, the same values.
     write_foreign(tmp_path / "a.spz", studied.run.source)
-    with studied.bench.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
+    with studied.context.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
         found = studied.judge.compare(scene)
     assert row["fidelity"] == pytest.approx(found.fidelity, abs=0.2)
 

@@ -74,6 +74,7 @@ def test_a_chart_shows_its_front() -> None:
     assert axes.get_xscale() == "log"
     lines = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
     assert lines["ways"] == [[1.0, 20.0], [10.0, 40.0]] and lines["Pareto front"][0] == [1.0, 20.0]
+    assert draw(replace(chart, log_y=True)).axes[0].get_yscale() == "log"
 
 
 def test_the_command_line_hands_on_what_it_is_told(

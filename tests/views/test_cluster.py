@@ -20,8 +20,8 @@ from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.methods.best.costs import PART_NAMES, cost_parts, cost_sums, measure_costs, put_costs
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views import cluster, worker
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.cluster import Cluster
+from flexgs_edge.views.render_context import RenderContext
 from flexgs_edge.views.sums import ViewSums
 from flexgs_edge.views.worker import Drawing
 from kernel_fixtures import large_budget, open_form
@@ -82,7 +82,7 @@ def test_sums_and_pictures_are_those_of_one_machine(monkeypatch: pytest.MonkeyPa
     found = []
     for draws in (None, workers):
         renderer = Renderer(open_form("numpy"), large_budget())
-        bench = Bench(renderer, draws)
+        bench = RenderContext(renderer, draws)
         with renderer.load(source, 100) as scene:
             costs = measure_costs(bench, scene, cameras())
             found.append([costs.removal, costs.weight2, costs.sh, costs.sh_mean])
@@ -102,7 +102,7 @@ def test_a_view_of_nothing_adds_nothing() -> None:
     with renderer.load(random_scene(90, 5, 1), 100) as scene:
         found = []
         for drawn in (True, False):
-            sums = ViewSums(Bench(renderer), scene, [cost_sums(renderer, 1)])
+            sums = ViewSums(RenderContext(renderer), scene, [cost_sums(renderer, 1)])
             sums.add_view(renderer.removal_sums(scene, cameras()[0]), cameras()[0])
             if drawn:
                 sums._add_drawn([], cameras()[-1])

@@ -13,7 +13,6 @@ import numpy as np
 
 from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
 from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
-from flexgs_edge.codec.v2.boxes import with_boxes
 from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, check_end, least_bytes
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
@@ -26,7 +25,28 @@ from flexgs_edge.codec.v2.walk import ChunkCodes, walk_chunk
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import atomic_write
 from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.memory.rows import read_rows
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+
+BOXES = "boxes"  # Its name among the settings of a file
+FEWEST, MOST = 8, 4096  # Fewer chunks come one after the other anyway; of more, the header would grow too long
+
+
+def with_boxes(settings: Mapping[str, Any], grid: GridScene, chunks: Sequence[Chunk]) -> dict[str, Any]:
+    """The settings of a file of these chunks, with their boxes if there are enough of them.
+
+    A box is seven integers: the least position codes x, y, z of the chunk's rows, the largest ones, and its rows with SH.
+    """
+    others = {name: value for name, value in settings.items() if name != BOXES}
+    if not FEWEST <= len(chunks) <= MOST:
+        return others
+    return {**others, BOXES: [_box(grid, slice(chunk.start, chunk.stop)) for chunk in chunks]}
+
+
+def _box(grid: GridScene, rows: slice) -> list[int]:
+    position = read_rows(grid.position, rows)
+    with_sh = int(np.count_nonzero(grid.sh_degrees[rows]))
+    return [*position.min(axis=1).tolist(), *position.max(axis=1).tolist(), with_sh]
 
 
 def decode_chunk(

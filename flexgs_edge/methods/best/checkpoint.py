@@ -15,7 +15,7 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.files import DISK_FULL
 from flexgs_edge.memory.rows import blocks, read_rows
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.effort import distil_steps, effort_of
+from flexgs_edge.methods.best.effort import effort_of, finetune_steps
 from flexgs_edge.methods.best.poses import is_fine
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.fingerprint import fingerprint
@@ -117,7 +117,7 @@ def open_checkpoint(
     """Open the folder for the rounds of a search. Its name holds a fingerprint of all that they depend on."""
     options = run.options
     # Rounds that lead to a descent also keep references from between the scored poses.
-    steps = distil_steps(options, len(scored), run.source.count, fine=is_fine(options, run.source))
+    steps = finetune_steps(options, len(scored), run.source.count, fine=is_fine(options, run.source))
     plan = effort_of(options)
     words = f"path {plan.keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {steps > 0}"
     if steps and plan.interleaved:

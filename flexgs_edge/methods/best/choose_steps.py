@@ -17,8 +17,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import CODE_LIMIT, SH_C0
-from flexgs_edge.grid.position_grid import plane_ranges, position_grid
-from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
+from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes, plane_ranges, position_grid
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import tilted, turned

@@ -161,7 +161,7 @@ def effort_of(options: CompressOptions) -> Effort:
     return plan if options.distil is None else replace(plan, interleaved=0)
 
 
-def distil_steps(options: CompressOptions, poses: int, count: int, fine: bool = False) -> int:
+def finetune_steps(options: CompressOptions, poses: int, count: int, fine: bool = False) -> int:
     """Steps of the descent to a candidate; 0 for none.
 
     `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `fine`: the poses have

@@ -22,21 +22,21 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import LAST, LONG, SHORT, Schedule, distil, share_of_lead, structure_of
+from flexgs_edge.methods.best.refit.finetune import LAST, LONG, SHORT, Schedule, finetune, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
-DISTILLED, DISTILLED_POWER = 0.46, -0.2
-"""Expected loss after a descent of one step for each scored pose, divided by the loss before it, until a candidate tells; and
-the power by which it changes with the steps: docs/results/tuning.md#distilled"""
+DISTILLED = 0.3
+"""Expected loss after a descent, divided by the loss before it, where no descent came between the rounds:
+docs/results/tuning.md#distilled"""
 BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
 """Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
 left and of the probe: docs/results/tuning.md#distilled"""
-BEHIND_LED = -0.09
-"""What a full lead of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
+BEHIND_MARGIN = -0.09
+"""What a full margin of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
 goes the course `SHORT`: docs/results/tuning.md#full_passes"""
@@ -44,9 +44,9 @@ FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVE_TO, MOST_LEFT = 0.8, 0.9
-"""The first candidate comes once two descents in a row leave more than the first share of the loss that the target allows. One
-that leaves more than the second does not count: docs/results/tuning.md#interleaved"""
+INTERLEAVE_TO = 0.8
+"""The first candidate comes once two descents in a row leave more than this share of the loss that the target allows:
+docs/results/tuning.md#interleaved"""
 MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
 many; and most descents: docs/results/tuning.md#interleaved"""
@@ -75,7 +75,7 @@ class Descents:
 
     steps: int  # of the descent to a candidate; 0 for none
     poses: int  # scored poses
-    lead: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
+    ssim_margin: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
 
     @property
     def passes(self) -> float:
@@ -91,8 +91,8 @@ class Descents:
     def after(self, excess: float, left: float | None = None) -> float:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
-            return excess + math.log(DISTILLED * math.pow(max(self.passes, 1.0), DISTILLED_POWER))
-        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_LED * share_of_lead(self.lead)
+            return excess + math.log(DISTILLED)
+        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
         return (left + excess) / 2 + behind
 
     @property
@@ -103,7 +103,6 @@ class Descents:
 FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
-FAR = 0.1  # Log of the share from which on we ask whether the descent mended anything
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""
@@ -166,9 +165,9 @@ class GridMaker:
         started = time.perf_counter()
         kept, step_sizes = self._choice(multiplier)
         by_size = target.limit_bytes is not None
-        grid = self._distilled(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
+        grid = self._finetuned(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
-        if not (self.steps and self.refit) or by_size or self._is_file or candidate.excess <= FAR:
+        if not (self.steps and self.refit) or by_size or self._is_file or candidate.excess <= 0.0:
             return candidate, grid
         before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         if before > candidate.excess:
@@ -226,8 +225,6 @@ class GridMaker:
                 planes = self.selection.last.planes
                 self._guess.learn(planes, target)
                 after = self._guess(planes, target)
-                if after >= math.log(MOST_LEFT):
-                    break
                 self._left = after
             self.selection.begin = len(self.rounds.snapshots) - 1
             # One alone may leave more by chance.
@@ -238,7 +235,7 @@ class GridMaker:
         """Rows and planes after a cut by half a round and a descent off the grid."""
         kept = self.selection.kept(self.selection.cut())
         schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=INTERLEAVED_LAST)
-        return kept.rows, self._distil(kept, schedule)
+        return kept.rows, self._finetune(kept, schedule)
 
     def _after(self, excess: float) -> float:
         """Expected excess of a candidate after its refit or descent, from that before it."""
@@ -255,7 +252,7 @@ class GridMaker:
 
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
         original, planes = self.rounds.original, snapshot.planes
-        return probe_slopes(original.bench.renderer, planes, original.origin, original.cameras, self.effort.probed)
+        return probe_slopes(original.context.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
         """The rows that a multiplier keeps, and the grid's step sizes."""
@@ -271,13 +268,13 @@ class GridMaker:
         kept.left_out = count - len(kept.rows)
         return kept, holdable(step_sizes, kept.planes)
 
-    def _distilled(self, kept: Kept, step_sizes: StepSizes, multiplier: float) -> GridScene:
+    def _finetuned(self, kept: Kept, step_sizes: StepSizes, multiplier: float) -> GridScene:
         """Move all values towards the references, put them on the grid, and refit the constant colour.
 
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
         worth = 0.0 if self._fixed_rows else multiplier
-        moved = self._distil(kept, self._schedule(1.0, kept.planes, multiplier=worth), step_sizes)
+        moved = self._finetune(kept, self._schedule(1.0, kept.planes, multiplier=worth), step_sizes)
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -338,8 +335,8 @@ class GridMaker:
         """
         original = self.rounds.original
         source = MemorySource(values_of(grid, self.rounds.storage), origin=original.origin)
-        with original.bench.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
-            costs = measure_costs(original.bench, scene, original.cameras, sh_costs=False)
+        with original.context.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
+            costs = measure_costs(original.context, scene, original.cameras, sh_costs=False)
         return np.where(costs.weight2 > 0, costs.removal, np.inf)
 
     def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
@@ -349,11 +346,11 @@ class GridMaker:
 
     @property
     def _descents(self) -> Descents:
-        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.lead)
+        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.ssim_margin)
 
-    def _distil(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        weight = structure_of(self._guess.lead)
-        return distil(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
+    def _finetune(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
+        weight = structure_of(self._guess.ssim_margin)
+        return finetune(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

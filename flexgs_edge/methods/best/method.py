@@ -1,7 +1,7 @@
 """`--method best`, the default: rate-distortion optimization with measured costs.
 
 `compress` chooses poses and storage, prunes in rounds, searches for the best candidate, writes it and measures it. The
-search asks for exact sizes (`GridCoder`) and measured quality (`Judge`).
+search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluator`).
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
+from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
+from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
 from flexgs_edge.methods.best.selection import Measure
-from flexgs_edge.methods.best.spill import MemoryPlan, choose_storage
-from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
-from flexgs_edge.run.judge import Judge, measurement_of
-from flexgs_edge.run.judges import Judges
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.evaluators import Evaluators
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -58,35 +58,35 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 2.
 
-    `run`: planned, with views and a target. `bench`: draws the views. Its renderer gets the storage that the search
+    `run`: planned, with views and a target. `context`: draws the views. Its renderer gets the storage that the search
     needs. Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene
     does not fit.
     """
-    assert bench is not None  # the plan has refused runs without views
+    assert context is not None  # the plan has refused runs without views
     output = run.output.path
-    with Judges(run, bench) as judges:
-        poses = choose_poses(run, bench, judges.decide)
+    with Evaluators(run, context) as judges:
+        poses = choose_poses(run, context, judges.decide)
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
-        storage = bench.renderer.storage = choose_storage(run, bench.renderer, poses.cameras, folder)
+        storage = context.renderer.storage = choose_storage(run, context.renderer, poses.cameras, folder)
         judges.prepare()
         kept = None
         if run.options.resume:
             with run.clock.stage("fingerprint"):
-                kept = open_checkpoint(run, bench.renderer, poses.cameras, folder)
+                kept = open_checkpoint(run, context.renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
-        coder = GridCoder(bench.renderer, settings_room(run))
+        coder = GridCoder(context.renderer, settings_room(run))
         maker = grid_maker(run.options, coder)
-        grid, search = search_best(maker, run, bench, poses, judges.decide, checkpoint=kept)
+        grid, search = search_best(maker, run, context, poses, judges.decide, checkpoint=kept)
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
             with run.clock.stage("layers"):
                 parts = (HALF,) * (run.options.layers - 1)
-                grid = assign_layers(grid, parts, coder.bits(grid), bench, poses.cameras, run.progress)
+                grid = assign_layers(grid, parts, coder.bits(grid), context, poses.cameras, run.progress)
         settings = make_settings(run, search)
-        preview = _preview(run, coder, bench, poses.cameras, grid, settings)
+        preview = _preview(run, coder, context, poses.cameras, grid, settings)
         if output is None:
             size, quality = _tried(run, coder, grid, settings, preview, judges)
         else:
@@ -99,12 +99,12 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
                         f"{run.target.describe()}: with its layers and its preview the file has {size} bytes; "
                         "ask for fewer layers (--layers) or a smaller preview (--preview)"
                     )
-                quality = judges.measure(decoded(open_fgs(place), bench.renderer))
+                quality = judges.measure(decoded(open_fgs(place), context.renderer))
             LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()
         storage.close()
-        return Made(
+        return MethodResult(
             size=size,
             count=grid.count,
             sh_count=grid.sh_count,
@@ -121,7 +121,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
 def _preview(
     run: Run[CompressOptions],
     coder: GridCoder,
-    bench: Bench,
+    context: RenderContext,
     cameras: Sequence[Camera],
     grid: GridScene,
     settings: dict[str, Any],
@@ -136,7 +136,7 @@ def _preview(
     if not most:
         return b""
     with run.clock.stage("preview"):
-        preview = make_preview(grid, most, coder.bits(grid), bench, cameras, settings, run.progress)
+        preview = make_preview(grid, most, coder.bits(grid), context, cameras, settings, run.progress)
     if preview:
         LOG.info("a preview of %s comes first", format_size(len(preview)))
     else:
@@ -150,7 +150,7 @@ def _tried(
     grid: GridScene,
     settings: dict[str, Any],
     preview: bytes,
-    judges: Judges,
+    judges: Evaluators,
 ) -> tuple[int, Quality]:
     """Bytes and quality of the file in a dry run. A report reads the contents from a file that is removed afterwards."""
     if run.reporter is not None:
@@ -175,15 +175,15 @@ def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]
     return make
 
 
-def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> ScoredPoses:
+def choose_poses(run: Run[CompressOptions], context: RenderContext, judge: QualityEvaluator) -> ScoredPoses:
     """`scored_poses` for a run.
 
-    `run`: planned. `bench`: its renderer has nothing loaded. `judge`: on the views that decide.
+    `run`: planned. `context`: its renderer has nothing loaded. `judge`: on the views that decide.
     """
     return scored_poses(
         run.seen.of(run.seen.train),
         run.options,
-        bench.renderer,
+        context.renderer,
         run.source,
         judge.covered_decides,
         judge.cameras,
@@ -193,10 +193,10 @@ def choose_poses(run: Run[CompressOptions], bench: Bench, judge: Judge) -> Score
 
 def search_best(
     make: MakerOf[Product],  # `grid_maker`, or what makes a file of another format
-    run: Run[CompressOptions],  # Planned. The storage of `bench.renderer` holds its scene as a whole.
-    bench: Bench,  # draws the views
+    run: Run[CompressOptions],  # Planned. The storage of `context.renderer` holds its scene as a whole.
+    context: RenderContext,  # draws the views
     poses: ScoredPoses,  # from `scored_poses`
-    judge: Judge,  # prepared on the views that decide
+    judge: QualityEvaluator,  # prepared on the views that decide
     checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run (`--resume`)
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
@@ -205,14 +205,14 @@ def search_best(
     fit.
     """
     with (
-        open_rounds(run, bench, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
+        open_rounds(run, context, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
         run.clock.stage("search"),
     ):
         further = 0
 
         def see(views: Sequence[int], number: int) -> bool:
             nonlocal further
-            beside = poses.beside([judge.cameras[view] for view in views], bench.renderer, run.source)
+            beside = poses.beside([judge.cameras[view] for view in views], context.renderer, run.source)
             seen = rounds.see(beside, number, poses.known)
             if seen:
                 further += len(beside)
@@ -234,14 +234,14 @@ def search_best(
 @contextmanager
 def open_rounds(
     run: Run[CompressOptions],  # planned
-    bench: Bench,  # draws the views
+    context: RenderContext,  # draws the views
     scored: Sequence[Camera],  # from `scored_poses`
     checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run
     known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
 ) -> Iterator[PruneRounds]:
     """Open the rounds of pruning for one search, or for several that share them, the weakest compression first."""
-    source, options, budget, storage = run.source, run.options, run.budget, bench.renderer.storage
-    plan = MemoryPlan.of(run, bench.renderer, scored)
+    source, options, budget, storage = run.source, run.options, run.budget, context.renderer.storage
+    plan = MemoryPlan.of(run, context.renderer, scored)
     budget.require("a search by measured costs", plan.held + plan.least)
     budget.take("the scene and its search", plan.held)
     try:
@@ -251,7 +251,7 @@ def open_rounds(
                 poses = [*scored, *between]
                 turns = known.slopes(poses) if known and plan.steps else None
                 rounds = PruneRounds(
-                    Original(bench, source.origin, scored, references, between, run.progress, plan.steps, turns),
+                    Original(context, source.origin, scored, references, between, run.progress, plan.steps, turns),
                     source,
                     refit=options.refit,
                     unseen_share=options.unseen_share,
@@ -266,12 +266,12 @@ def search_rounds(
     make: MakerOf[Product],
     rounds: PruneRounds,
     run: Run[CompressOptions],
-    judge: Judge,
+    judge: QualityEvaluator,
     on_step: Callable[[Step], None] | None = None,
     see: See | None = None,
 ) -> tuple[Product, SearchResult]:
     """Search as `search_best` does, from rounds that are open already."""
-    renderer, source = rounds.original.bench.renderer, run.source
+    renderer, source = rounds.original.context.renderer, run.source
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:

@@ -9,8 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance, between
-from flexgs_edge.cameras.nearness import nearest, squared_distances
-from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture
+from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture, nearest, squared_distances
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
@@ -270,7 +269,7 @@ def scored_poses(
 ) -> ScoredPoses:
     """Choose as many poses as the effort scores. Each next pose is the one that adds most to what those before it see.
 
-    A few poses chosen like this give costs about as good as all poses do: docs/results/speed.md#scoring-fewer-views
+    A few poses chosen like this give costs about as good as all poses do.
 
     With `makes_poses`, generated poses come on top: see `margin_of` and `needed_poses`.
 

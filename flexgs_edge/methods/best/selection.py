@@ -102,7 +102,7 @@ class Selection:
         return index, keep, degrees
 
 
-LEAD_FROM = 1.0
+MARGIN_FROM = 1.0
 """Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
 PRUNED_PART = 0.45
 """Share of the allowed loss that pruning alone uses up when a candidate meets the target: docs/results/tuning.md#pruned_part"""
@@ -117,22 +117,22 @@ class Measure(Protocol):
 class Guess:
     """Guesses the excess of planes.
 
-    `measure`: quality of planes. `lead`: by how much SSIM is nearer to its bound than the mean, as a log. That changes
+    `measure`: quality of planes. `ssim_margin`: by how much SSIM is nearer to its bound than the mean, as a log. That changes
     little with compression or by a refit, so it is not measured each time: docs/results/tuning.md#lead
     """
 
     def __init__(self, measure: Measure) -> None:
-        self._measure, self.lead = measure, 0.0
+        self._measure, self.ssim_margin = measure, 0.0
 
     def __call__(self, planes: Planes, target: Target) -> float:
-        """Excess of planes by a target for quality, from the mean loss and the lead."""
-        return mean_alone(target).excess(0, self._measure(planes, estimate=True)) + self.lead
+        """Excess of planes by a target for quality, from the mean loss and the margin."""
+        return mean_alone(target).excess(0, self._measure(planes, estimate=True)) + self.ssim_margin
 
     def learn(self, planes: Planes, target: Target) -> None:
-        """Measure the lead, if SSIM is bounded."""
+        """Measure the margin, if SSIM is bounded."""
         if bounds_ssim(target):
             quality = self._measure(planes)
-            self.lead = max(means(target).excess(0, quality) - mean_alone(target).excess(0, quality), 0.0)
+            self.ssim_margin = max(means(target).excess(0, quality) - mean_alone(target).excess(0, quality), 0.0)
 
     def prune(self, selection: Selection, target: Target, part: float, times: float = 1.0) -> None:
         """Prune until pruning alone loses `part` of what the target allows, or `times` the rows are left that a size allows."""
@@ -144,9 +144,9 @@ class Guess:
             if len(rounds.snapshots) == 1:
                 return False
             excess = self(last.planes, target)
-            if self.lead == 0.0 and excess >= end - LEAD_FROM:
+            if self.ssim_margin == 0.0 and excess >= end - MARGIN_FROM:
                 self.learn(last.planes, target)
-                excess += self.lead
+                excess += self.ssim_margin
             return excess >= end
 
         selection.prune(enough)

@@ -16,38 +16,38 @@ from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.allocation import BitModel, OneDegree, choose
 from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_maker import GridMaker
+from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.method import MakerOf, See, choose_poses, search_best
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.selection import Measure
-from flexgs_edge.methods.best.spill import expected_bytes as expected_bytes
 from flexgs_edge.methods.foreign.file_maker import FileMaker, open_files, publish
-from flexgs_edge.run.judges import Judges
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.evaluators import Evaluators
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.units import format_size
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
     """Compress a scene into a file of another program's format.
 
-    `run`: planned. `bench`: draws the views.
+    `run`: planned. `context`: draws the views.
     """
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     # The plan has refused runs without views.
-    assert bench is not None and plan is not None and plan.target is not None and format is not None
-    with Judges(run, bench) as judges:
+    assert context is not None and plan is not None and plan.target is not None and format is not None
+    with Evaluators(run, context) as judges:
         judges.prepare()
         if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
-        poses = choose_poses(run, bench, judges.decide)
+        poses = choose_poses(run, context, judges.decide)
         with open_files(run, format) as files:
             LOG.info("searching for %s", plan.target.describe())
-            grid, search = search_best(file_maker(options, files), run, bench, poses, judges.decide)
+            grid, search = search_best(file_maker(options, files), run, context, poses, judges.decide)
             judges.decided()
             file = files.of(grid)
             source = read_foreign(file)
@@ -55,7 +55,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
             if output is not None:
                 publish(file, output, options.force)
                 LOG.info("wrote %s, %s", output, format_size(size))
-        return Made(
+        return MethodResult(
             size=size,
             count=grid.count,
             sh_count=grid.sh_count if source.sh_degree else 0,

@@ -15,7 +15,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantize_scene, quantized_bytes
-from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.scene.source import SceneSource
 
 QUANTIZE_COPIES = 4  # Copies of a chunk's planes that quantizing holds at once: as read, gathered, and codes in between
@@ -38,7 +38,7 @@ class SceneEvaluator:
     """
 
     def __init__(
-        self, ranked: Ranked, bits: BitSpec, groups: int | None, judge: Judge | None, budget: MemoryBudget
+        self, ranked: Ranked, bits: BitSpec, groups: int | None, judge: QualityEvaluator | None, budget: MemoryBudget
     ) -> None:
         self.source = ranked.source
         self.bits = bits

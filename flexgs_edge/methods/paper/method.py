@@ -17,36 +17,35 @@ from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import SearchResult, Step, step_words
 from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
-from flexgs_edge.methods.paper.score_cache import score_cache
-from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.scores import score_cache, score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
 from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity, search_bits
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.quality.psnr import error_for_drop
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes, read_often
+from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.foresight import drawing_bytes
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.run.judges import Judges
-from flexgs_edge.run.made import Made
+from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
 
 
 def bits_by_sensitivity(
-    evaluator: SceneEvaluator, run: Run[CompressOptions], bench: Bench
+    evaluator: SceneEvaluator, run: Run[CompressOptions], context: RenderContext
 ) -> tuple[BitSpec, list[Sensitivity]]:
     """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
-    renderer, source, views, base_psnr = bench.renderer, evaluator.source, run.seen, run.options.base_psnr
+    renderer, source, views, base_psnr = context.renderer, evaluator.source, run.seen, run.options.base_psnr
     count = min(SENSITIVITY_VIEWS, len(views.train))
     indices = [views.train[i * len(views.train) // count] for i in range(count)]
-    judge = Judge(bench, source, views, indices, with_photos=False, base_psnr=base_psnr)
+    judge = QualityEvaluator(context, source, views, indices, with_photos=False, base_psnr=base_psnr)
     with renderer.load(source) as original:
         judge.prepare(original, run.progress)
 
@@ -75,18 +74,18 @@ class Ranking:
     reused: bool = False  # whether their scores came from the cache
 
 
-def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
+def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 1.
 
-    `run`: planned. `bench`: draws the views; `None` for runs without views, whose rates are fixed.
+    `run`: planned. `context`: draws the views; `None` for runs without views, whose rates are fixed.
     """
-    if bench is not None:
+    if context is not None:
         with run.clock.stage("open"):  # the search reads the scene for every choice that it measures
-            source = read_often(run.source, run.budget, searching_bytes(run), bench.renderer.backend)
+            source = read_often(run.source, run.budget, searching_bytes(run), context.renderer.backend)
             run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
-    with nullcontext() if bench is None else Judges(run, bench) as judges:
-        ranking = _rank(run, judges, bench)
+    with nullcontext() if context is None else Evaluators(run, context) as judges:
+        ranking = _rank(run, judges, context)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
@@ -94,9 +93,9 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
         evaluator = SceneEvaluator(ranked, PAPER, groups, None if judges is None else judges.decide, run.budget)
         sensitivity: list[Sensitivity] = []
         if bits is None:
-            assert bench is not None
+            assert context is not None
             with run.clock.stage("sensitivity"):
-                bits, sensitivity = bits_by_sensitivity(evaluator, run, bench)
+                bits, sensitivity = bits_by_sensitivity(evaluator, run, context)
         evaluator.bits = bits
         with run.clock.stage("search"):
             search = _search(run, evaluator)
@@ -106,7 +105,7 @@ def compress(run: Run[CompressOptions], bench: Bench | None) -> Made:
         assert choice is not None
         with evaluator.quantized(choice) as quantized:
             quality = _write(run, quantized, search, judges)
-        return Made(
+        return MethodResult(
             size=evaluator.size(choice),
             count=quantized.count,
             sh_count=quantized.sh_count,
@@ -137,7 +136,7 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     )
 
 
-def _rank(run: Run[CompressOptions], judges: Judges | None, bench: Bench | None) -> Ranking:
+def _rank(run: Run[CompressOptions], judges: Evaluators | None, context: RenderContext | None) -> Ranking:
     """Draw the references, and score every Gaussian unless the cache has the scores."""
     assert run.plan is not None
     scores, reused, cache = None, False, None
@@ -148,13 +147,15 @@ def _rank(run: Run[CompressOptions], judges: Judges | None, bench: Bench | None)
         scores = cache.load(run.source.count)
         reused = scores is not None
         LOG.info("scores %s %s", "reused from" if reused else "will be kept in", cache.path)
-    if judges is not None and bench is not None:
+    if judges is not None and context is not None:
         with judges.original() as original:
             if run.plan.needs_scores and scores is None:
                 cameras = run.seen.of(run.seen.train)
                 LOG.info("scoring %d Gaussians over %d training poses", run.source.count, len(cameras))
                 with run.clock.stage("score"):
-                    scores = score_scene(bench.renderer, original, run.source, cameras, run.options.score, run.progress)
+                    scores = score_scene(
+                        context.renderer, original, run.source, cameras, run.options.score, run.progress
+                    )
     if cache is not None and scores is not None and not reused:
         cache.save(scores)
     order = np.arange(run.source.count) if scores is None else order_from_scores(scores)
@@ -176,7 +177,7 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
 
 
 def _write(
-    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Judges | None
+    run: Run[CompressOptions], quantized: QuantizedScene, search: SearchResult | None, judges: Evaluators | None
 ) -> Quality | None:
     """Write the file under a temporary name, measure the decoded scene, and only then give the file its name."""
     settings, output = make_settings(run, search, quantized.bits), run.output.path

@@ -9,8 +9,7 @@ import numpy as np
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, PlaneChart, Series
-from flexgs_edge.studies.experiment import Beside, Experiment
-from flexgs_edge.studies.result_tables import Cell, Table, columns, mean
+from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns, mean
 from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
 
 DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.

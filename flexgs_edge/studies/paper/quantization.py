@@ -8,8 +8,7 @@ from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.report.plots import BarChart, DotChart, LineChart, Series
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.scene.fields import FIELDS
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.result_tables import Cell, Experiment, Table, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RTN_BITS = tuple(range(2, 9))

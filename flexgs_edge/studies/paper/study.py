@@ -16,8 +16,8 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import require_matplotlib
 from flexgs_edge.report.run_info import record
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.paper import pruning, quantization, whole
+from flexgs_edge.studies.result_tables import Experiment
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, write_page, write_scene
 

@@ -12,12 +12,11 @@ from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.report.plots import BarChart, LineChart, Series
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
-from flexgs_edge.studies.experiment import Beside, Experiment
 from flexgs_edge.studies.paper.pruning import RATES
-from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns
 from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
@@ -59,7 +58,7 @@ def parts(studied: StudyScene) -> Experiment:
     """Measure ADP only, MPQ only, and both, at the choice of the search."""
     choice = studied.search.chosen.choice
     pruned = _pruned(studied, choice)
-    with studied.bench.renderer.load(pruned) as scene:
+    with studied.context.renderer.load(pruned) as scene:
         alone = measurement_of(studied.judge.compare(scene))
     quantized, both = studied.points([Setting(), Setting(choice)], "parts")
     none = Measurement(0.0 if studied.plan.figure == "drop" else None, None, 0.0)
@@ -224,7 +223,11 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
     ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = (studied.evaluator(Setting(choice)), studied.bench.renderer, studied.judge.cameras[0])
+    evaluator, renderer, first = (
+        studied.evaluator(Setting(choice)),
+        studied.context.renderer,
+        studied.judge.cameras[0],
+    )
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
         select_rows(ranks, choice, studied.has_sh)

@@ -22,9 +22,9 @@ from flexgs_edge.methods.best.poses import scored_poses
 from flexgs_edge.methods.foreign.file_maker import open_files
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.outputs import Output
 from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.studies.result_tables import Cell, Column, columns
@@ -138,7 +138,7 @@ def paper_points(studied: StudyScene, ratios: Sequence[float]) -> Found:
 
 def _paper_point(studied: StudyScene, ratio: float | None, choice: Choice, seconds: float) -> RatePoint:
     evaluator = studied.evaluator(Setting(choice))
-    with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
+    with evaluator.quantized(choice) as quantized, studied.context.renderer.load_quantized(quantized) as scene:
         quality = _judged(studied, scene)
     kept, _ = evaluator.counts(choice)
     variant = WHOLE if ratio is not None else UNPRUNED
@@ -155,14 +155,14 @@ def best_points(studied: StudyScene, effort: str, ratios: Sequence[float]) -> Fo
         options, max_drop=None, min_fidelity=None, max_size=None, min_ratio=min(ratios), max_worst_drop=None
     )
     cameras, covered = studied.views.of(studied.views.train), studied.judge.covered_decides
-    poses = scored_poses(cameras, largest, studied.bench.renderer, source, covered)
+    poses = scored_poses(cameras, largest, studied.context.renderer, source, covered)
     found = NOTHING
     started = time.perf_counter()
     run = replace(run, options=options)
-    with open_rounds(run, studied.bench, poses.cameras, known=poses.known) as rounds:
+    with open_rounds(run, studied.context, poses.cameras, known=poses.known) as rounds:
         for ratio in sorted(ratios):
             aimed = run.aimed_at(_target(studied, ratio))
-            coder = GridCoder(studied.bench.renderer, settings_room(aimed))
+            coder = GridCoder(studied.context.renderer, settings_room(aimed))
             make = grid_maker(options, coder)
             with run.clock.stage("search"):
                 grid, search = search_rounds(make, rounds, aimed, studied.judge)
@@ -200,7 +200,7 @@ def _peer_point(studied: StudyScene, name: str, format: Format, place: Path) -> 
         # Rows in the order that `compress` writes: neighbours along the curve have similar bytes.
         path, decoded = files.write(source.select(near_order(source)))
         seconds = time.perf_counter() - started
-        with studied.bench.renderer.load(decoded) as scene:
+        with studied.context.renderer.load(decoded) as scene:
             quality = _judged(studied, scene)
         return RatePoint(name, WHOLE, None, None, path.stat().st_size, decoded.count, quality, seconds)
 
@@ -210,7 +210,7 @@ def _target(studied: StudyScene, ratio: float) -> MaxSize:
 
 
 def _judged_source(studied: StudyScene, grid: GridScene) -> Quality:
-    with studied.bench.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
+    with studied.context.renderer.load(MemorySource(from_grid(grid), origin=grid.origin)) as scene:
         return _judged(studied, scene)
 
 

@@ -14,9 +14,9 @@ from typing import Any
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.rate import trade
 from flexgs_edge.studies.rate.points import MAX, Found, best_points, paper_points, peer_points
+from flexgs_edge.studies.result_tables import Experiment
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 

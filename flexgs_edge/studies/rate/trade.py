@@ -7,9 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from flexgs_edge.report.plots import LineChart, Series
-from flexgs_edge.studies.experiment import Experiment
 from flexgs_edge.studies.rate.points import MAX, WHOLE, RatePoint, loss_of, point_columns, point_row
-from flexgs_edge.studies.result_tables import Cell, Table, mean
+from flexgs_edge.studies.result_tables import Cell, Experiment, Table, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
 LEAST_LOSS = 0.001

@@ -14,8 +14,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.report.results import CompressResult, decided_words
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Table, columns
+from flexgs_edge.studies.result_tables import Cell, Experiment, Table, columns
 from flexgs_edge.studies.study_scene import scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 

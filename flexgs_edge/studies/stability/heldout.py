@@ -13,9 +13,8 @@ from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.plots import BarChart
 from flexgs_edge.run.few_poses import evenly
-from flexgs_edge.run.judge import Judge
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
+from flexgs_edge.studies.result_tables import Cell, Experiment, Row, Table, columns
 from flexgs_edge.studies.stability.ours import (
     BEST,
     BREAK,
@@ -62,7 +61,7 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
             whole[HELD] = search(studied, path, Promised(studied.target, (WorstView(studied.target.figure, limit),)))
     rows = []
     train = evenly(studied.views.of(studied.views.train), len(cameras))
-    renderer = studied.bench.renderer
+    renderer = studied.context.renderer
     with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in train]
     for name in (*contenders.names, *whole):
@@ -104,8 +103,8 @@ def held_out(studied: StudyScene, path: PruneRounds, contenders: Contenders, amo
 
 def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
     source = studied.run.source
-    judge = Judge(
-        studied.bench,
+    judge = QualityEvaluator(
+        studied.context,
         source,
         studied.views,
         studied.judge.indices[::2],
@@ -113,7 +112,7 @@ def _decided_on_even(studied: StudyScene, path: PruneRounds) -> Whole:
         studied.run.options.base_psnr,
     )
     try:
-        with studied.bench.renderer.load(source) as original:
+        with studied.context.renderer.load(source) as original:
             judge.prepare(original, studied.run.progress)
         return search(studied, path, studied.target, judge)
     finally:

@@ -28,7 +28,7 @@ from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import Series
-from flexgs_edge.run.judge import Judge, measurement_of
+from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.studies.paper.pruning import nearest
 from flexgs_edge.studies.result_tables import Row
@@ -57,7 +57,7 @@ def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
 @contextmanager
 def drawn(studied: StudyScene, evaluator: SceneEvaluator, choice: Choice) -> Iterator[DeviceScene]:
     """The scene of a choice, quantized and loaded."""
-    with evaluator.quantized(choice) as quantized, studied.bench.renderer.load_quantized(quantized) as scene:
+    with evaluator.quantized(choice) as quantized, studied.context.renderer.load_quantized(quantized) as scene:
         yield scene
 
 
@@ -102,24 +102,24 @@ def walked(
     studied: StudyScene, source: SceneSource, cameras: Sequence[Camera], margin: bool = False
 ) -> Iterator[PruneRounds]:
     """Open rounds of pruning over some poses (with `margin`, also generated ones), for any number of searches."""
-    options, bench = replace(studied.run.options, views_margin=margin), studied.bench
+    options, context = replace(studied.run.options, views_margin=margin), studied.context
     run = replace(studied.run.of_source(source), options=options)
-    poses = scored_poses(cameras, options, bench.renderer, source, studied.judge.covered_decides)
-    with open_rounds(run, bench, poses.cameras, known=poses.known) as rounds:
+    poses = scored_poses(cameras, options, context.renderer, source, studied.judge.covered_decides)
+    with open_rounds(run, context, poses.cameras, known=poses.known) as rounds:
         yield rounds
 
 
-def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: Judge | None = None) -> Whole:
+def search(studied: StudyScene, rounds: PruneRounds, target: Target, judge: QualityEvaluator | None = None) -> Whole:
     """Search for a target; the closest candidate if none meets it."""
     judge = judge or studied.judge
-    made = _search(studied, rounds, judge, rounds.original.bench.renderer)
+    made = _search(studied, rounds, judge, rounds.original.context.renderer)
     with studied.run.clock.stage("search"):
         found = search_by(made, target, best_effort=True)
     multiplier = found.chosen.multiplier
     return _whole(made, found.product, multiplier, found.reached)
 
 
-def _search(studied: StudyScene, rounds: PruneRounds, judge: Judge, renderer: Renderer) -> GridMaker:
+def _search(studied: StudyScene, rounds: PruneRounds, judge: QualityEvaluator, renderer: Renderer) -> GridMaker:
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=rounds.original.origin)) as scene:
             return measurement_of(judge.estimate(scene) if estimate else judge.compare(scene))
@@ -171,7 +171,7 @@ class Contenders:
     def loaded(self, name: str) -> Iterator[DeviceScene]:
         """The decoded scene of its file, loaded to draw."""
         if name in self.wholes:
-            with self.studied.bench.renderer.load(self.wholes[name].source) as scene:
+            with self.studied.context.renderer.load(self.wholes[name].source) as scene:
                 yield scene
         else:
             setting = self.settings[name]

@@ -10,7 +10,7 @@ from typing import Any
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.studies.experiment import Experiment
+from flexgs_edge.studies.result_tables import Experiment
 from flexgs_edge.studies.stability.heldout import held_out
 from flexgs_edge.studies.stability.ours import Contenders, search, walked
 from flexgs_edge.studies.stability.unseen_poses import FULL, QUICK, Amounts, poses

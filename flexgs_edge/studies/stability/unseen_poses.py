@@ -13,8 +13,7 @@ from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.report.plots import BarChart, LineChart
 from flexgs_edge.run.few_poses import evenly
-from flexgs_edge.studies.experiment import Experiment
-from flexgs_edge.studies.result_tables import Cell, Row, Table, columns
+from flexgs_edge.studies.result_tables import Cell, Experiment, Row, Table, columns
 from flexgs_edge.studies.stability.ours import BEST, BREAK, LOST, WORDS, Contenders, curve, number
 from flexgs_edge.studies.study_scene import StudyScene
 from flexgs_edge.views.depths import visible_depths
@@ -75,7 +74,7 @@ def make_poses(studied: StudyScene, amounts: Amounts) -> list[Poses]:
     """All sets, the training poses first."""
     train = studied.views.of(studied.views.train)
     base = evenly(studied.judge.cameras, amounts.poses)
-    depths = visible_depths(studied.bench.renderer, studied.run.source, base)
+    depths = visible_depths(studied.context.renderer, studied.run.source, base)
     near = [min(train, key=lambda other: float(np.linalg.norm(other.center - camera.center))) for camera in base]
     made = [Poses(TRAINING, None, evenly(train, amounts.poses)), Poses(HELD_OUT, None, base)]
     made += [
@@ -120,7 +119,7 @@ class Seen:
 
 def look(studied: StudyScene, contenders: Contenders, cameras: Sequence[Camera]) -> dict[str, Seen]:
     """Compare all contenders with the original over some views."""
-    renderer = studied.bench.renderer
+    renderer = studied.context.renderer
     with renderer.load(studied.run.source) as scene:
         originals = [renderer.render(scene, camera) for camera in cameras]
     found = {}

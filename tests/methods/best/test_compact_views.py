@@ -17,7 +17,7 @@ from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import sum_row_bytes
-from flexgs_edge.render.camera_record import camera_record
+from flexgs_edge.render.ahead import camera_record
 from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunks import SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
@@ -26,9 +26,9 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
+from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import NotedSource, joined, look_from, make_camera, random_scene
 
@@ -59,7 +59,7 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
         assert (scene.shown is not None) == (storage is not None)
     found |= {"hits": statistics.hits, "weights": statistics.weights}
     with drawer.load(SCENE, 100) as scene, References() as references:
-        costs = measure_costs(Bench(drawer), scene, cameras())
+        costs = measure_costs(RenderContext(drawer), scene, cameras())
         found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
         planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
         for view, camera in enumerate(cameras()):
@@ -67,7 +67,7 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
         planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
         degrees = np.arange(SCENE.count) % 3
         moved = refit_colours(
-            planes, degrees, Original(Bench(drawer), SCENE.origin, cameras(), references), 2, subsets=2
+            planes, degrees, Original(RenderContext(drawer), SCENE.origin, cameras(), references), 2, subsets=2
         )
     drawer.release()
     return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
@@ -128,8 +128,8 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
             budget.limit = held + limit
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
-                    measure_costs(Bench(drawer), scene, views)
-                refit_colours(planes, degrees, Original(Bench(drawer), SCENE.origin, views, references), 1)
+                    measure_costs(RenderContext(drawer), scene, views)
+                refit_colours(planes, degrees, Original(RenderContext(drawer), SCENE.origin, views, references), 1)
                 drawn.append(limit)
             except BudgetError as error:
                 assert not drawn and "a view" in str(error)

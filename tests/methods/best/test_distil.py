@@ -21,14 +21,14 @@ from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.distil import (
+from flexgs_edge.methods.best.refit.finetune import (
     FIELD_RATES,
-    FULL_LEAD,
+    FULL_MARGIN,
     HELD,
-    LED_STRUCTURE,
+    MARGIN_STRUCTURE,
     STRUCTURE,
     Schedule,
-    distil,
+    finetune,
     structure_of,
 )
 from flexgs_edge.quality.ssim import ssims
@@ -36,9 +36,9 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
+from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project
@@ -86,11 +86,11 @@ class Workshop:
 
     def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
         structure = words.pop("structure", STRUCTURE)
-        return distil(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
+        return finetune(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
 
     @property
     def seen(self) -> Original:
-        return Original(Bench(self.renderer), np.zeros(3), self.cameras, self.references)
+        return Original(RenderContext(self.renderer), np.zeros(3), self.cameras, self.references)
 
     def rounded(self, planes: Planes) -> Planes:
         return from_grid(to_grid(planes, self.degrees, STEPS, np.zeros(3))[0])
@@ -116,8 +116,10 @@ def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> No
 
 
 def test_structure_weighs_more_where_ssim_decides() -> None:
-    assert structure_of(0.0) == STRUCTURE < structure_of(FULL_LEAD / 2) < structure_of(FULL_LEAD) == LED_STRUCTURE
-    assert structure_of(9.0) == LED_STRUCTURE
+    assert (
+        structure_of(0.0) == STRUCTURE < structure_of(FULL_MARGIN / 2) < structure_of(FULL_MARGIN) == MARGIN_STRUCTURE
+    )
+    assert structure_of(9.0) == MARGIN_STRUCTURE
 
 
 def test_the_structural_term_keeps_structure(workshop: Workshop) -> None:
@@ -208,8 +210,8 @@ def test_too_little_memory_is_said_and_leaves_nothing_taken(
         budget = MemoryBudget(limit)
         renderer = Renderer(TwinBackend(budget), budget)
         try:
-            original = Original(Bench(renderer), np.zeros(3), workshop.cameras, workshop.references)
-            distil(workshop.kept, workshop.degrees, original, Schedule(1))
+            original = Original(RenderContext(renderer), np.zeros(3), workshop.cameras, workshop.references)
+            finetune(workshop.kept, workshop.degrees, original, Schedule(1))
         except BudgetError as error:
             refused.append(str(error))
         else:

@@ -13,8 +13,8 @@ from flexgs_edge.methods.best.effort import (
     LARGEST_STEP,
     LEAST_STEPS,
     MANY_POSES,
-    distil_steps,
     effort_of,
+    finetune_steps,
     sampled_poses,
     sampling_steps,
 )
@@ -34,16 +34,16 @@ def test_efforts_grow() -> None:
 
 def test_who_descends() -> None:
     passes, least = EFFORTS["balanced"].passes, EFFORTS["balanced"].descends
-    assert distil_steps(CompressOptions(), 100, 1000 * least) == round(100 * passes)
-    assert distil_steps(CompressOptions(), 100, least, fine=True) == round(100 * passes * FINE_PASSES)
-    assert distil_steps(CompressOptions(), 2, least) == LEAST_STEPS
-    assert distil_steps(CompressOptions(), 4 * MANY_POSES, least) == round(2 * MANY_POSES * passes)
-    assert distil_steps(CompressOptions(), 100, least - 1) == 0 < distil_steps(CompressOptions(), 100, least)
-    assert distil_steps(CompressOptions(effort="max"), 100, least - 1) > 0
-    assert distil_steps(CompressOptions(distil=7), 100, least - 1) == 7
+    assert finetune_steps(CompressOptions(), 100, 1000 * least) == round(100 * passes)
+    assert finetune_steps(CompressOptions(), 100, least, fine=True) == round(100 * passes * FINE_PASSES)
+    assert finetune_steps(CompressOptions(), 2, least) == LEAST_STEPS
+    assert finetune_steps(CompressOptions(), 4 * MANY_POSES, least) == round(2 * MANY_POSES * passes)
+    assert finetune_steps(CompressOptions(), 100, least - 1) == 0 < finetune_steps(CompressOptions(), 100, least)
+    assert finetune_steps(CompressOptions(effort="max"), 100, least - 1) > 0
+    assert finetune_steps(CompressOptions(distil=7), 100, least - 1) == 7
     assert effort_of(CompressOptions()).interleaved > 0 == effort_of(CompressOptions(distil=7)).interleaved
     for words in ({"distil": 0}, {"refit": False}, {"effort": "fast"}):
-        assert distil_steps(CompressOptions(**words), 100, least) == 0, words
+        assert finetune_steps(CompressOptions(**words), 100, least) == 0, words
 
 
 @pytest.mark.parametrize(

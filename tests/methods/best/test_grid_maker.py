@@ -14,7 +14,7 @@ from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, Target
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.grid_maker import FIT_DESCENTS, LEAST_FIT, MOST_FIT, fits, rate_from
-from flexgs_edge.methods.best.refit.distil import Schedule
+from flexgs_edge.methods.best.refit.finetune import Schedule
 from flexgs_edge.methods.best.search import search
 from flexgs_edge.methods.best.selection import ALL_LEFT
 from known_rounds import AT, EFFORT, UNIT, FakeRounds, KnownMaker
@@ -38,7 +38,7 @@ class Mended(KnownMaker):
         drop = 3 * gone * (self.part if (logits > MARK - 1).all() else 1.0)
         return Measurement(drop, 30.0, drop, ssim_drop=None if estimate else self.ssim * drop)
 
-    def _distil(self, kept: Any, schedule: Schedule, step_sizes: Any = None) -> Any:
+    def _finetune(self, kept: Any, schedule: Schedule, step_sizes: Any = None) -> Any:
         logits = kept.planes["opacity_logits"]
         self.calls.append((schedule.iterations, step_sizes is not None, logits.shape[1]))
         return {**kept.planes, "opacity_logits": np.full_like(logits, MARK)}

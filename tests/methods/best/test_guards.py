@@ -25,12 +25,12 @@ from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.doubts import FIT_GAP, NEEDED_VIEWS, doubts
 from flexgs_edge.run.few_poses import MOST, STEP, FewPoses
-from flexgs_edge.run.judge import measurement_of
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.run.warnings import FIT_GAP, NEEDED_VIEWS, warnings
 from flexgs_edge.views.depths import middle_of, visible_depths
 from kernel_fixtures import count, draw, large_budget, open_form
 from synthetic import make_camera, make_splats, random_scene
@@ -265,7 +265,7 @@ def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
 def test_doubts(
     scored: Scored | None, trained: float | None, held_out: float | None, cameras: str, words: list[str]
 ) -> None:
-    found = doubts(ViewSet([], None, [], [], cameras, None), scored, 1000, trained, held_out)
+    found = warnings(ViewSet([], None, [], [], cameras, None), scored, 1000, trained, held_out)
     assert len(found) == len(words)
     for text, wanted in zip(found, words):
         assert re.search(wanted, text), text

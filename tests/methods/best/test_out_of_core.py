@@ -22,7 +22,7 @@ from flexgs_edge.methods.best import effort, grid_maker
 from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.effort import EFFORTS
 from flexgs_edge.methods.best.grid_maker import INTERLEAVED_SHARE, GridMaker
-from flexgs_edge.methods.best.refit.distil import Schedule
+from flexgs_edge.methods.best.refit.finetune import Schedule
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.original import Original
 from synthetic import random_scene
@@ -119,21 +119,20 @@ def test_descents_between_the_rounds_are_not_done_again(
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
     monkeypatch.setitem(EFFORTS, "max", replace(EFFORTS["max"], interleaved=3))
     monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVE_TO", 99.0)
-    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.MOST_LEFT", 99.0)
     words: dict[str, Any] = {**TINY, "effort": "max"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}
     moved: list[int] = []
-    whole, descend = GridMaker.make, grid_maker.distil
+    whole, descend = GridMaker.make, grid_maker.finetune
 
-    def distil(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any, **words: Any) -> Any:
+    def finetune(planes: Any, degrees: Any, original: Original, schedule: Schedule, *more: Any, **words: Any) -> Any:
         moved.append(schedule.iterations)
         return descend(planes, degrees, original, schedule, *more, **words)
 
     def stop(*_: Any) -> Any:
         raise Stop
 
-    monkeypatch.setattr(grid_maker, "distil", distil)
+    monkeypatch.setattr(grid_maker, "finetune", finetune)
     monkeypatch.setattr(GridMaker, "make", stop)
     with pytest.raises(Stop):
         compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)

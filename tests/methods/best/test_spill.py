@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.synth import synth
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.methods.best.spill import row_bytes
+from flexgs_edge.methods.best.memory_plan import row_bytes
 from flexgs_edge.units import format_mib, parse_size
 from synthetic import random_scene
 from tiny_project import write_cameras

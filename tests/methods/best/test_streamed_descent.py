@@ -13,7 +13,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
-from flexgs_edge.methods.best.refit.distil import FIELD_RATES
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.methods.best.refit.streamed_descent import StreamedDescent
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD

@@ -48,8 +48,8 @@ def refit_colours(
     round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1. Returns the
     planes, with new arrays of what has moved.
     """
-    bench, cameras = original.bench, original.cameras
-    renderer, storage = bench.renderer, bench.renderer.storage
+    context, cameras = original.context, original.cameras
+    renderer, storage = context.renderer, context.renderer.storage
     fields = ("sh_dc", "sh_rest") if bands else ("sh_dc",)
     planes = {**planes, **{name: storage.copy(planes[name]) for name in fields}}
     thinned = max(len(cameras) // ROUND_VIEWS, 1)
@@ -62,7 +62,7 @@ def refit_colours(
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree if bands else 0)
     with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
         for part in original.progress.track(parts, "refitting colours", len(parts)):
-            normal = ViewSums(bench, scene, [normal_sums(renderer, bands)])
+            normal = ViewSums(context, scene, [normal_sums(renderer, bands)])
             try:
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
                     normal.add_view(renderer.residual_sums(scene, camera, original.references[view]), camera)

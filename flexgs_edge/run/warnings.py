@@ -13,7 +13,7 @@ from flexgs_edge.scene.source import some_positions
 from flexgs_edge.small_matrices import product
 
 FIT_GAP = 2.0  # We warn of overfitting when training views show this much more fidelity than held-out views, dB
-NEEDED_VIEWS = 16  # We warn below this many scored views; more change little: docs/results/speed.md#scoring-fewer-views
+NEEDED_VIEWS = 16  # We warn below this many scored views; more change little
 UNSEEN_SHARE = 0.01  # We warn when automatic views miss more than this share of the Gaussians
 
 
@@ -22,7 +22,7 @@ _SAMPLE_ROWS = 2048
 _SAMPLE_VIEWS = 64
 
 
-def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
+def frame_warnings(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
     """Warn if the scene lies behind the cameras, or out of sight of most: a sample of positions and cameras tells.
 
     Files of phones often break the rule of their format. Cameras around a scene tell nothing of that, as it lies before some of
@@ -56,7 +56,7 @@ def frame_doubts(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
     return ()
 
 
-def doubts(
+def view_warnings(
     views: ViewSet, scored: Scored | None, count: int, trained: float | None, held_out: float | None
 ) -> tuple[str, ...]:
     """Warnings of a run, as sentences for a person.

@@ -1,4 +1,4 @@
-"""Self-distillation: fine-tunes all values of the remaining Gaussians against renders of the original.
+"""Fine-tunes all values of the remaining Gaussians against renders of the original.
 
 It needs no photos and adds no Gaussians, so the result cannot look better than the original.
 """
@@ -22,9 +22,9 @@ from flexgs_edge.views.original import Original
 FIELD_RATES = {"log_scales": 4e-2, "quats": 4.8e-3, "opacity_logits": 8e-2, "sh_dc": 8e-3, "sh_rest": 1e-3}
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
 takes tens of thousands of steps, ours hundreds: docs/results/tuning.md#field_rates"""
-STRUCTURE, LED_STRUCTURE, FULL_LEAD = 0.02, 0.04, 0.3
-"""Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the lead of SSIM
-from which the second one holds in full. A lead is the log of how much more of its bound SSIM has used than the mean:
+STRUCTURE, MARGIN_STRUCTURE, FULL_MARGIN = 0.02, 0.04, 0.3
+"""Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the margin
+of SSIM from which the second one holds in full, the log of how much more of its bound SSIM has used than the mean:
 docs/results/tuning.md#led_structure"""
 LAST, LAST_HELD = 0.06, 0.03
 """Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
@@ -97,14 +97,14 @@ class Schedule:
         return np.concatenate(rounds)[: self.iterations]
 
 
-def structure_of(lead: float) -> float:
-    """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `lead`, which is 0 or more."""
-    return STRUCTURE + (LED_STRUCTURE - STRUCTURE) * share_of_lead(lead)
+def structure_of(ssim_margin: float) -> float:
+    """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `ssim_margin`, 0 or more."""
+    return STRUCTURE + (MARGIN_STRUCTURE - STRUCTURE) * share_of_margin(ssim_margin)
 
 
-def share_of_lead(lead: float) -> float:
-    """0 where the mean decides, up to 1 where SSIM leads by `FULL_LEAD` or more."""
-    return min(lead / FULL_LEAD, 1.0)
+def share_of_margin(ssim_margin: float) -> float:
+    """0 where the mean decides, up to 1 where SSIM leads by `FULL_MARGIN` or more."""
+    return min(ssim_margin / FULL_MARGIN, 1.0)
 
 
 def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
@@ -114,7 +114,7 @@ def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
     return {"means": means_rate * extent, **FIELD_RATES}
 
 
-def distil(
+def finetune(
     planes: dict[str, np.ndarray],  # stored planes of the kept Gaussians ([width, n] f32 by field); not changed
     degrees: np.ndarray,  # [n] u8, SH degree kept for each row. Coefficients above it stay zero.
     original: Original,
@@ -133,7 +133,7 @@ def distil(
     cameras, course = original.poses, schedule.course
     rates = {**rates_for(cameras, course.means_rate), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    renderer, storage = original.bench.renderer, original.bench.renderer.storage
+    renderer, storage = original.context.renderer, original.context.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
@@ -151,7 +151,7 @@ def distil(
                 if held and len(parts[1]):
                     descent.settle()
                 descent.put_on(step_sizes)
-            for k in original.progress.track(part, f"distilling{' on the grid' if place else ''}", len(part)):
+            for k in original.progress.track(part, f"fine-tuning{' on the grid' if place else ''}", len(part)):
                 now = schedule.rate * last ** ((k - falling.start) / len(falling))
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 # On the grid, a plain mean first, then one that forgets: single views then decide little.

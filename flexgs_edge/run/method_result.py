@@ -12,7 +12,7 @@ from flexgs_edge.quality.view_quality import Quality
 
 
 @dataclass(frozen=True)
-class Made:
+class MethodResult:
     """A finished file: its size, the search that found it, and its quality.
 
     `count`, `sh_count`, `sh_degree`: Gaussians, those with SH above degree 0, and the highest SH degree.

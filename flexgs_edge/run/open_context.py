@@ -1,4 +1,4 @@
-"""Open the bench of a run: backend, renderer and, if asked for, a cluster."""
+"""Open the context of a run: backend, renderer and, if asked for, a cluster."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.spent import run_info
-from flexgs_edge.views.bench import Bench
 from flexgs_edge.views.cluster import Cluster
+from flexgs_edge.views.render_context import RenderContext
 from flexgs_edge.views.worker import Drawing
 
 
-def open_bench(
+def open_context(
     run: Run[Any], cluster: str | None = None, needed: Callable[[], int] | None = None, compares: bool = True
-) -> Bench:
-    """Open the renderer, and the cluster if there is one. Close the bench when done.
+) -> RenderContext:
+    """Open the renderer, and the cluster if there is one. Close the context when done.
 
     With `needed`, errors about the memory limit name one that is enough for the whole run: see `foresee`.
 
@@ -36,23 +36,23 @@ def open_bench(
         with run.clock.stage("open"):
             foresee(run, False, needed, compares)
     backend = counted_backend(options.device, run.budget, run.clock)
-    bench = Bench(Renderer(backend, run.budget, *drawing))
+    context = RenderContext(Renderer(backend, run.budget, *drawing))
     if needed is not None:
         foresee(run, True, needed, compares)
     try:
         if cluster is not None:
             with run.clock.stage("cluster"):
-                bench.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
+                context.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
         if run.reporter is not None and run.views is not None:
             run.reporter.reserve(run.budget, run.views)
     except BaseException:
-        bench.close()
+        context.close()
         raise
-    return bench
+    return context
 
 
-def bench_info(run: Run[Any], bench: Bench | None) -> RunInfo:
+def context_info(run: Run[Any], context: RenderContext | None) -> RunInfo:
     """Record seconds, memory and device of a run that draws. Files never store this record: their bytes would change."""
-    if bench is None:
+    if context is None:
         return run_info(run.budget, run.clock)
-    return run_info(run.budget, run.clock, bench.renderer.backend, bench.renderer.storage)
+    return run_info(run.budget, run.clock, context.renderer.backend, context.renderer.storage)

@@ -14,9 +14,8 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.quality.exposure import exposure_gains, with_gains
 from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
-from flexgs_edge.quality.psnr import contrast, far_bases, mse
+from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, mse, with_gains
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
@@ -25,7 +24,7 @@ from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.bench import Bench
+from flexgs_edge.views.render_context import RenderContext
 
 SHARE = 4
 """Reference images take at most one part in `SHARE` of the free budget. The scene and its views need the rest."""
@@ -42,7 +41,7 @@ def work_bytes(cameras: Sequence[Camera]) -> int:
     return LIBRARY_BYTES + WORK_BYTES * max(camera.width * camera.height for camera in cameras)
 
 
-class Judge:
+class QualityEvaluator:
     """Compares a scene with the original, and with photos, over some views.
 
     Without photos, the figures over covered pixels decide: background that the original leaves empty must not dilute an
@@ -55,7 +54,7 @@ class Judge:
 
     def __init__(
         self,
-        bench: Bench,  # Draws both scenes. Kept images take at most a quarter of its free budget.
+        context: RenderContext,  # Draws both scenes. Kept images take at most a quarter of its free budget.
         source: SceneSource,  # The original. A reference that was not kept is drawn again.
         views: ViewSet,  # all views of the run
         indices: Sequence[int],  # the views to compare
@@ -63,8 +62,8 @@ class Judge:
         base_psnr: float = DEFAULT_BASE_PSNR,  # PSNR of the original that the modelled drop starts from, dB
         reports: bool = False,
     ) -> None:
-        self.bench, self.renderer = bench, bench.renderer
-        budget = bench.renderer.budget
+        self.context, self.renderer = context, context.renderer
+        budget = context.renderer.budget
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
@@ -194,14 +193,14 @@ class Judge:
 
         `lpips`: also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.bench.ready_cluster is not None
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.context.ready_cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
         known = self._known.get(drawn) if drawn is not None else None
         if known is not None and (known.worst_flip or not flip):
             return known
         ssims, flips = self._ssims if with_ssim else None, self._flips if flip else None
         found: list[ViewQuality] = []
-        images = self.bench.images(scene, self.cameras)
+        images = self.context.images(scene, self.cameras)
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error, similar = self._original_error[i] if self.photos is not None else None, self._original_ssim.get(i)
             original = self.original(i)

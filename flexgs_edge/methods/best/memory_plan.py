@@ -14,7 +14,7 @@ from pathlib import Path
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
-from flexgs_edge.methods.best.effort import EFFORTS, distil_steps
+from flexgs_edge.methods.best.effort import EFFORTS, finetune_steps
 from flexgs_edge.methods.best.poses import is_fine
 from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
@@ -70,7 +70,7 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
     source, options = run.source, run.options
     cameras = run.seen.of(run.seen.train)
     size = size_of(largest_of(cameras))  # poses of large weight keep all their pixels
-    distils = distil_steps(options, len(cameras), source.count) > 0
+    distils = finetune_steps(options, len(cameras), source.count) > 0
     held = sum(needed_bytes(DEFAULT, size, source, len(cameras), options, distils))
     if run.output.format is not None:
         return held
@@ -93,7 +93,7 @@ class MemoryPlan:
     def of(cls, run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera]) -> MemoryPlan:
         """The plan of a search with these scored poses, where the renderer's storage is."""
         source, options, largest = run.source, run.options, largest_of(scored)
-        steps = distil_steps(options, len(scored), source.count, is_fine(options, source))
+        steps = finetune_steps(options, len(scored), source.count, is_fine(options, source))
         if renderer.storage.spills:
             return cls(steps, SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest, steps > 0))
         view = view_size(renderer.backend, largest)

@@ -14,7 +14,7 @@ from flexgs_edge.views.cluster import Cluster
 
 
 @dataclass
-class Bench:
+class RenderContext:
     """Draws the views of a run; a context manager that closes the cluster and the backend."""
 
     renderer: Renderer  # owns the backend and the budget
@@ -43,7 +43,7 @@ class Bench:
         self.renderer.release()
         self.renderer.backend.close()
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> RenderContext:
         return self
 
     def __exit__(self, *exc: object) -> None:
