@@ -127,7 +127,7 @@ Several scenes:
     type=click.Choice(["fast", "balanced", "max"]),
     default="balanced",
     show_default=True,
-    help="fast, balanced or max. More effort: smaller files, slower.",
+    help="fast or balanced: smaller files, slower. max is another word for balanced.",
 )
 @option(
     MACHINES,

@@ -48,7 +48,7 @@ class Choice:
 
 Phase = Literal["list", "refine", "confirm", "fixed", "multiplier"]
 MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
-REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}  # Measured points of the refinement for each `--effort`
+REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 10}  # Measured points of the refinement for each `--effort`
 
 
 @dataclass(frozen=True)

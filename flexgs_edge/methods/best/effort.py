@@ -23,9 +23,6 @@ LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
 
-REFITTED = 0.61
-"""Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
-docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
 """Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
 in every view: docs/results/tuning.md#distances"""
@@ -51,9 +48,10 @@ class Effort:
     # `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
     # docs/results/tuning.md#pixels
     pixels: int
-    # `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
+    # Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells.
+    # The fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
     # makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
-    refitted: float = REFITTED
+    refitted: float
     probed: int = 8  # most poses that trial grids are measured on: docs/results/tuning.md#probed
     # How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0
     # (default): colours are refitted instead.
@@ -61,7 +59,6 @@ class Effort:
     # Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
     # docs/results/tuning.md#interleaved
     interleaved: int = 0
-    interleave_at: float = 0.8  # pruning stops for such a descent at this share of the loss that the target allows
     # Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
     # docs/results/tuning.md#descends
     descends: int = 0
@@ -140,19 +137,8 @@ EFFORTS = {
         interleaved=2,
         descends=10_000,
     ),
-    "max": Effort(
-        keep=0.8,
-        refit_rounds=2,
-        subsets=7,
-        close=0.09,
-        few=400,
-        views=400,
-        pixels=24,
-        passes=16.0,
-        interleaved=16,
-        interleave_at=0.6,
-    ),
 }
+EFFORTS["max"] = EFFORTS["balanced"]  # another word for it: more work gained less than a tenth on most scenes
 
 
 def effort_of(options: CompressOptions) -> Effort:

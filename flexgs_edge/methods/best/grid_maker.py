@@ -44,6 +44,7 @@ FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
+INTERLEAVE_AT = 0.8  # Pruning stops for a descent at this share of the loss that the target allows
 INTERLEAVE_TO = 0.8
 """The first candidate comes once two descents in a row leave more than this share of the loss that the target allows:
 docs/results/tuning.md#interleaved"""
@@ -218,7 +219,7 @@ class GridMaker:
         """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
         by_size, after = target.limit_bytes is not None, -math.inf
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
-            self._guess.prune(self.selection, target, self.effort.interleave_at, fit)
+            self._guess.prune(self.selection, target, INTERLEAVE_AT, fit)
             self.rounds.renew(self._cut_and_descend)
             before = after
             if not by_size:

@@ -90,11 +90,6 @@ def test_finished_files_fit(project: Path, tmp_path: Path, suffix: str) -> None:
     assert result.reached and 0.7 * limit < path.stat().st_size <= limit and result.size == path.stat().st_size
 
 
-def test_max_refits_more_where_nothing_descends(project: Path, tmp_path: Path) -> None:
-    found = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **{**FAST, "effort": "max"})
-    assert found.search is not None and found.search.reached and found.size == (tmp_path / "a.spz").stat().st_size
-
-
 def test_out_of_reach(project: Path, tmp_path: Path) -> None:
     words = {**FAST, "min_fidelity": 150.0}
     with pytest.raises(TargetError, match=r"fidelity >= 150 dB .*the closest point.*--best-effort"):
