@@ -64,15 +64,15 @@ All runs: [left_out.csv](left_out.csv).
 
 
 def put(name: str, value: Any) -> None:
-    """Give a constant another value, wherever it was imported: of the effort, of short descents, or of a module."""
+    """Give a constant another value, wherever it was imported: of the effort, of descents, or of a module."""
     plan = EFFORTS[EFFORT]
     if hasattr(plan, name):
         EFFORTS[EFFORT] = replace(plan, **{name: value})
         return
     modules = [module for key, module in sys.modules.items() if key.startswith("flexgs_edge.methods.best")]
-    course = next(module.SHORT for module in modules if hasattr(module, "SHORT"))
+    course = next(module.COURSE for module in modules if hasattr(module, "COURSE"))
     if hasattr(course, name):
-        name, value = "SHORT", replace(course, **{name: value})
+        name, value = "COURSE", replace(course, **{name: value})
     found = [module for module in modules if hasattr(module, name)]
     assert found, f"{name}: no such constant"
     for module in found:
