@@ -22,7 +22,7 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.finetune import LAST, LONG, SHORT, Schedule, finetune, share_of_margin, structure_of
+from flexgs_edge.methods.best.refit.finetune import COURSE, LAST, Schedule, finetune, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
@@ -32,14 +32,14 @@ from flexgs_edge.scene.source import MemorySource, Planes
 DISTILLED = 0.3
 """Expected loss after a descent, divided by the loss before it, where no descent came between the rounds:
 docs/results/tuning.md#distilled"""
-BEHIND_SHORT, BEHIND_LONG = 0.03, 0.02
-"""Log of the loss after a first candidate's descent, `SHORT` or `LONG`, over the middle of what the last descent between rounds
-left and of the probe: docs/results/tuning.md#distilled"""
+BEHIND = 0.03
+"""Log of the loss after a first candidate's descent over the middle of what the last descent between rounds left and of the
+probe: docs/results/tuning.md#distilled"""
 BEHIND_MARGIN = -0.09
-"""What a full margin of SSIM adds to `BEHIND_SHORT`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
+"""What a full margin of SSIM adds to `BEHIND`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
 FULL_PASSES = 10
-"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one, and a shorter one
-goes the course `SHORT`: docs/results/tuning.md#full_passes"""
+"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
+docs/results/tuning.md#full_passes"""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
@@ -86,19 +86,14 @@ class Descents:
     def schedule(self, share: float, fidelity: float | None, last: float = LAST, multiplier: float = 0.0) -> Schedule:
         """A descent with `share` of a candidate's steps, from planes of this fidelity."""
         rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
-        course = LONG if self._long else SHORT
-        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=course)
+        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=COURSE)
 
     def after(self, excess: float, left: float | None = None) -> float:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
         if left is None:
             return excess + math.log(DISTILLED)
-        behind = BEHIND_LONG if self._long else BEHIND_SHORT + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
+        behind = BEHIND + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
         return (left + excess) / 2 + behind
-
-    @property
-    def _long(self) -> bool:
-        return self.passes >= FULL_PASSES
 
 
 FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes

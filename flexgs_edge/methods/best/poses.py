@@ -22,9 +22,9 @@ from flexgs_edge.views.depths import visible_depths
 
 LEAST = 1e-6  # Least weight of a pose
 STEP = 4  # Every fourth pixel in both directions is compared
-POWER, RARE_POWER = 4.8, 2.4
-"""Powers of the slope, and of how rare a pose's picture is. The slope alone would minimise the mean drop; higher powers lift
-the worst view, as a soft maximum does: docs/results/tuning.md#view_weights"""
+POWER = 4.8
+"""Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
+does: docs/results/tuning.md#view_weights"""
 
 
 @dataclass(frozen=True)
@@ -71,28 +71,11 @@ def base_errors(
     return np.array([error if base is None else mse_of_psnr(base) for error, base in zip(errors, bases, strict=True)])
 
 
-def view_weights(slopes: np.ndarray, rare: np.ndarray) -> np.ndarray:
-    """How much an error counts in each scored pose, relative to the largest weight.
-
-    `slopes`: [n] f64, from `KnownErrors.slopes`. `rare`: [n] f64, from `rareness`. Returns [n] f64, above 0 to 1.
-    """
-    weights: np.ndarray = slopes**POWER * rare**RARE_POWER
+def view_weights(slopes: np.ndarray) -> np.ndarray:
+    """[n] f64, above 0 to 1: how much an error counts in each scored pose, from `KnownErrors.slopes`."""
+    weights: np.ndarray = slopes**POWER
     relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
     return relative
-
-
-def rareness(cameras: Sequence[Camera], points: np.ndarray, near: float) -> np.ndarray:
-    """[n] f64, above 0 to 1: mean over the points in each picture of 1 / number of poses that have them in theirs.
-
-    `cameras`: the scored poses. `points`: [3, k] f64, a sample of the scene's positions, world coordinates. `near`:
-    near plane, scene units.
-    """
-    seen = np.array([in_picture(camera, points, near) for camera in cameras])
-    share = seen / np.maximum(seen.sum(axis=0), 1)
-    found: np.ndarray = share.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-    # A pose that shows none of the points counts as the least of the others.
-    shown = found > 0
-    return np.where(shown, found, found[shown].min()) if shown.any() else np.ones(len(cameras))
 
 
 EVERY, BETWEEN = 8, 7
@@ -297,7 +280,7 @@ def scored_poses(
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:
-            weights = view_weights(errors.slopes(chosen), rareness(chosen, positions, renderer.near))
+            weights = view_weights(errors.slopes(chosen))
             # As many pixels as without weights, which may be more than are needed.
             steps = sampling_steps(chosen, pixels_of(chosen, steps), weights=weights)
         if max(steps) > 1 and covered_decides:

@@ -25,7 +25,7 @@ from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.choose_steps import holdable
 from flexgs_edge.methods.best.effort import STEP_UNIT
 from flexgs_edge.methods.best.layers import worthiest
-from flexgs_edge.methods.best.refit.finetune import SHORT, Schedule, finetune
+from flexgs_edge.methods.best.refit.finetune import Schedule, finetune
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.scene.growth import growth
@@ -70,13 +70,13 @@ def make_preview(
         del planes
         rows = 8 * most / bits.of_degree(0)
         for times in STAGES:
-            small = _stage(small, times * rows, original, Schedule(STEPS, rate=RATE, course=SHORT))
+            small = _stage(small, times * rows, original, Schedule(STEPS, rate=RATE))
         coded = _Coded(small, grid, drawn, storage)
         for _ in range(TRIES):
             rows = coded.rows_in(most)
             if rows < 1:
                 break
-            made = _stage(small, rows, original, Schedule(LAST_STEPS, rate=RATE, course=SHORT), grid.step_sizes)
+            made = _stage(small, rows, original, Schedule(LAST_STEPS, rate=RATE), grid.step_sizes)
             coded = _Coded(made, grid, drawn, storage)
             if len(coded.file) <= most:
                 return coded.file

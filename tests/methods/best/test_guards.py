@@ -30,7 +30,7 @@ from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.run.warnings import FIT_GAP, NEEDED_VIEWS, warnings
+from flexgs_edge.run.warnings import FIT_GAP, NEEDED_VIEWS, view_warnings
 from flexgs_edge.views.depths import middle_of, visible_depths
 from kernel_fixtures import count, draw, large_budget, open_form
 from synthetic import make_camera, make_splats, random_scene
@@ -262,16 +262,16 @@ def test_a_compression_with_margin(project: Path, tmp_path: Path) -> None:
         (None, 41.0, 30.0, "auto", ["11.0 dB less"]),
     ],
 )
-def test_doubts(
+def test_warnings(
     scored: Scored | None, trained: float | None, held_out: float | None, cameras: str, words: list[str]
 ) -> None:
-    found = warnings(ViewSet([], None, [], [], cameras, None), scored, 1000, trained, held_out)
+    found = view_warnings(ViewSet([], None, [], [], cameras, None), scored, 1000, trained, held_out)
     assert len(found) == len(words)
     for text, wanted in zip(found, words):
         assert re.search(wanted, text), text
 
 
-def test_doubts_are_told(project: Path, plain: CompressResult) -> None:
+def test_warnings_are_told(project: Path, plain: CompressResult) -> None:
     """6 poses are few, and fitted: in the result, its JSON, the summary and the page."""
     fitted, few = plain.warnings
     assert "dB on training views and" in fitted and few.startswith("Only 6 camera views were used; below about 16 ")
