@@ -14,7 +14,6 @@ LABELS = {
     "compress --method paper": "paper",
     "compress --effort fast": "fast",
     "compress": "balanced",
-    "compress --effort max": "max",
 }
 """What each command of `EFFORTS` is called in the chart, the fastest first."""
 

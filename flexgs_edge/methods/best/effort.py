@@ -120,25 +120,26 @@ def pixels_of(cameras: Sequence[Camera], steps: Sequence[float]) -> int:
     return sum(int(camera.width * camera.height / step**2) for camera, step in zip(cameras, steps, strict=True))
 
 
+_BALANCED = Effort(
+    keep=0.8,
+    refit_rounds=2,
+    subsets=7,
+    close=0.13,
+    few=400,
+    views=400,
+    pixels=24,
+    refitted=0.64,
+    passes=8.0,
+    interleaved=2,
+    descends=10_000,
+)
 EFFORTS = {
     "fast": Effort(
         keep=0.77, refit_rounds=0, subsets=7, close=0.3, few=32, views=96, pixels=12, refitted=0.93, probed=4
     ),
-    "balanced": Effort(
-        keep=0.8,
-        refit_rounds=2,
-        subsets=7,
-        close=0.13,
-        few=400,
-        views=400,
-        pixels=24,
-        refitted=0.64,
-        passes=8.0,
-        interleaved=2,
-        descends=10_000,
-    ),
+    "balanced": _BALANCED,
+    "max": _BALANCED,  # another word: more work gained less than a tenth on most scenes
 }
-EFFORTS["max"] = EFFORTS["balanced"]  # another word for it: more work gained less than a tenth on most scenes
 
 
 def effort_of(options: CompressOptions) -> Effort:
