@@ -10,11 +10,7 @@ from benchmarks.harness import ROOT
 from flexgs_edge.report.plots import LineChart, Series, picture
 
 IMAGE = ROOT / "docs" / "images" / "presets.png"
-LABELS = {
-    "compress --method paper": "paper",
-    "compress --effort fast": "fast",
-    "compress": "balanced",
-}
+LABELS = {"compress --method paper": "paper", "compress --effort fast": "fast", "compress": "balanced"}
 """What each command of `EFFORTS` is called in the chart, the fastest first."""
 
 

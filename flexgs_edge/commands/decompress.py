@@ -24,7 +24,7 @@ from flexgs_edge.io.exchange import (
     write_offset,
     write_streamed,
 )
-from flexgs_edge.io.formats import FORMATS, WRITTEN, written_format
+from flexgs_edge.io.formats import FORMATS, WRITTEN, Format, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
@@ -41,6 +41,7 @@ from flexgs_edge.scene.source import SceneSource
 
 WRITE_COPIES = 3
 """Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
+LEAST_ROWS = 1024  # Rows of a PLY that are written at a time, at least
 SPARE_SHARE = 8
 """Of what decoding takes, one part in so many is left free beside rows of a PLY: docs/results/tuning.md#heap"""
 WARN_DROP = 0.5
@@ -120,6 +121,8 @@ def decompress(
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
         scene = load_scene(input, reading=reading)
+        enough = budget.used + scene.held_bytes + _writing_bytes(scene.source, format)
+        budget.foreseen = lambda: enough
         budget.take("reading the scene", scene.held_bytes)
         recenter = recenter and bool(np.any(scene.source.origin))
         if recenter:
@@ -145,7 +148,7 @@ def decompress(
                 notes = write_foreign(output, source, force=force, writing=writing)
         else:
             row = WRITE_COPIES * inria_dtype(scene.source.sh_degree).itemsize
-            least, decoding = min(scene.source.count, 1024), decode_bytes(scene.source, backend)
+            least, decoding = min(scene.source.count, LEAST_ROWS), decode_bytes(scene.source, backend)
             rows = budget.rows("decoding", row, fixed=decoding + decoding // SPARE_SHARE, minimum=least, most=65536)
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
@@ -170,6 +173,18 @@ def decompress(
         LOG.warning("warning: %s", warning)
     info = run_info(budget, clock, backend)
     return DecompressResult(scene_info(scene), os.fspath(output), size, info, notes, loss, warnings)
+
+
+def _writing_bytes(source: SceneSource, format: Format | None) -> int:
+    """Bytes that decoding and writing take at least."""
+    decoding = decode_bytes(source, None)
+    if format is not None:
+        return format.memory * source.count + decoding
+    return (
+        WRITE_COPIES * inria_dtype(source.sh_degree).itemsize * min(source.count, LEAST_ROWS)
+        + decoding
+        + decoding // SPARE_SHARE
+    )
 
 
 def _layers(input: ScenePlace, count: int, reading: Reading) -> tuple[tuple[int, ...], SceneSource | None]:

@@ -12,6 +12,7 @@ from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.codes import opacities
 from flexgs_edge.io.exchange import MovedSource, written_order
 from flexgs_edge.report.file_results import ConversionLoss
+from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.inputs import CheckedScene, load_scene
 from flexgs_edge.run.open_context import open_context
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
@@ -62,6 +63,8 @@ def conversion_loss(
         return ConversionLoss(values, why=f"--cameras {NO_CAMERAS}")
     try:
         run = open_run(scene, replace(options, holdout=0, resolution=WIDTH, images="none"), photos=False)
+        if options.device != "numpy":
+            run.budget.require("the OpenCL runtime", RUNTIME_BYTES + BUILD_BYTES)
         chosen = run.seen.train[:: -(-len(run.seen.train) // VIEWS)]
         with open_context(run) as context:
             judge = QualityEvaluator(context, run.source, run.seen, chosen)

@@ -14,6 +14,7 @@ from flexgs_edge.commands.decompress import WARN_DROP, decompress
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.io.streamed_sog_writer import STREAMED
+from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.run.inputs import load_scene, read_scene
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.source import MemorySource, Planes
@@ -75,6 +76,9 @@ def test_pictures_that_are_not_compared_have_a_reason(planes: Planes, tmp_path: 
     assert unseen.loss is not None and unseen.loss.views == 0 and "not compared: --cameras none" in unseen.summary()
     elsewhere = decompress(tmp_path / "a.ply", tmp_path / "b.spz", device="no such device")
     assert elsewhere.loss is not None and "no such device" in elsewhere.loss.why
+    limit = MemoryBudget.from_limit(None).used + 40 * 2**20
+    tight = decompress(tmp_path / "a.ply", tmp_path / "d.spz", memory_limit=limit)
+    assert tight.loss is not None and "the OpenCL runtime needs 112MiB" in tight.loss.why
     with pytest.raises(InputError, match=r"none\.json"):
         decompress(tmp_path / "a.ply", tmp_path / "c.spz", cameras=str(tmp_path / "none.json"))
     assert not (tmp_path / "c.spz").exists()
