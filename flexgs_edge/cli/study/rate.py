@@ -32,19 +32,13 @@ RATIOS = RatiosType()
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
 @help_page.option(
-    "Points",
-    "--ratios",
-    type=RATIOS,
-    default="8,16,32,64,128,256",
-    show_default=True,
-    help="Ratios to the .ply that both methods aim at.",
+    "Points", "--ratios", type=RATIOS, default="8,16,32,64,128,256", help="Ratios to the .ply that both methods aim at."
 )
 @help_page.option(
     "Points",
     "--effort",
     type=click.Choice(["fast", "balanced", "max"]),
     default="balanced",
-    show_default=True,
     help="Effort of the search at these ratios, as for compress.",
 )
 @help_page.option(
@@ -52,7 +46,6 @@ RATIOS = RatiosType()
     "--distilled",
     type=RATIOS,
     default="32,64,128",
-    show_default=True,
     help="Ratios for --method best with --effort max, which is slow; none: skip this.",
 )
 @shared_options.study_options
