@@ -31,6 +31,8 @@ from flexgs_edge.scene.lower_sh import TrimmedSource
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.render_context import RenderContext
 
+LOG = logging.getLogger("flexgs_edge")
+
 
 def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[SceneSource, np.ndarray]:
     """Write a scene without SH in a format and read it back: the geometry that `write_foreign` would give.
@@ -45,9 +47,6 @@ def read_geometry(folder: Path, source: SceneSource, format: Format) -> tuple[Sc
         return read_foreign(path), written_order(source)
     finally:
         path.unlink()
-
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.render_context import RenderContext
 
+LOG = logging.getLogger("flexgs_edge")
+
 
 class CostMaker:
     """Makes files of a format by measured costs; a `Maker`.
@@ -142,9 +144,6 @@ def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[WrittenFil
         return maker
 
     return make
-
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
