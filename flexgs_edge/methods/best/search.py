@@ -29,7 +29,8 @@ MOST, MOST_TRIED = 4, 6
 """Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
 of both."""
 PROBES = 4  # Most probes before the first candidate
-AIM = -0.01  # Log of the share that we aim at
+AIM, FARTHER = -0.01, 0.05
+"""Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
 SLOPE, SIZE_SLOPE = 0.7, -0.45
 """Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
 docs/results/tuning.md#slope"""
@@ -221,8 +222,9 @@ def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     """
     by_size = target.limit_bytes is not None
     slope = SIZE_SLOPE if by_size else SLOPE
+    misses = next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
     points = [(math.log(step.multiplier), step.excess) for step in steps]
-    place = next_point(weighed(points), slope, LARGEST_STRIDE)
+    place = next_point(weighed([(at, excess + FARTHER * misses) for at, excess in points]), slope, LARGEST_STRIDE)
     low, high = _bracket(points, slope)
     place = min(max(place, low), high)
     return place if place > math.log(1e-30) and all(abs(place - at) > LEAST_CHANGE for at, _ in points) else None
