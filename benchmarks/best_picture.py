@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SCENE = ROOT / "samples" / "still_life" / "point_cloud.ply"
 PICTURE = ROOT / "docs" / "images" / "best.png"
-EFFORTS = {"fast": "#E69F00", "balanced": "#0072B2", "max": "#CC79A7"}
+EFFORTS = {"fast": "#E69F00", "balanced": "#0072B2"}
 FLOAT = 4
 """Bytes of a value in a PLY."""
 INK, GREY = "#222222", "#b9c1c9"

@@ -54,11 +54,10 @@ DEFAULT = "compress"
 EFFORTS = {
     DEFAULT: "default",
     "compress --effort fast": "`--effort fast`",
-    "compress --effort max": "`--effort max`",
     "compress --method paper": "`--method paper`",
 }
 FORMATS = ("compress -o X.spz", "compress -o X.sog", "compress -o X.compressed.ply")
-MEAN = ("compress --promise mean", "compress --effort max --promise mean", "compress --method paper --promise mean")
+MEAN = ("compress --promise mean", "compress --method paper --promise mean")
 COMMANDS = {
     **{command: tuple(SCENES) for command in EFFORTS},
     **dict.fromkeys(MEAN, tuple(SCENES)),

@@ -1,8 +1,8 @@
 """Fuzzes all readers: every mutated file must raise an error of ours or be read as valid values.
 
-    python -m benchmarks.fuzz                          # a million, and writes docs/results/fuzzing.md: 8 processor minutes
+    python -m benchmarks.fuzz                          # a million: 8 processor minutes
     python -m benchmarks.fuzz --part 0.1               # a tenth of it
-    python -m benchmarks.fuzz --tries 2000 --only v2   # 2000 of one kind; writes nothing
+    python -m benchmarks.fuzz --tries 2000 --only v2   # 2000 of one kind
 
 Every try has a number, which is the seed of its random choices: `--from N --tries 1` repeats one. Mutations of containers
 are of two kinds. `verify` must find all *plain* ones. *Sealed* ones have corrected checksums, so that they reach the
@@ -56,7 +56,6 @@ from flexgs_edge.scene.source import SceneSource
 
 SEEDS = ROOT / "tests" / "fuzz" / "seeds"
 """Small valid files that mutations start from."""
-TABLE = ROOT / "docs" / "results" / "fuzzing.md"
 SLOW = 1.0
 """Most processor seconds of a try."""
 STUCK = 20.0
@@ -316,16 +315,7 @@ def fuzz(kind: Kind, first: int, tries: int, keep: Path | None = None) -> Tally:
     return fuzzer.tally
 
 
-HEAD = """# Fuzzing
-
-Small valid files (`tests/fuzz/seeds`) are changed and read. `python -m benchmarks.fuzz` makes this page. Each try has a number,
-the seed of its choices, so it can be made again. The tests repeat a part (`tests/fuzz`), and read the files of
-`tests/fuzz/corpus`, which must be refused.
-
-*Plain* changes of a container leave its checksums as they were: `verify` must find every one. *Sealed* ones correct them, so that
-the decoders meet the change: they may give finite values, or an error that names the file. A change is of up to four bits, bytes
-or numbers, or of pieces; in text, of words and lines; in JSON, of values and keys. A warning of arithmetic counts as a crash.
-
+HEAD = """
 | what | tries | refused | read | not found | crashes, warnings | over {slow:g} s | slowest | most allocated | of its bound |
 |---|---|---|---|---|---|---|---|---|---|
 """
@@ -337,7 +327,7 @@ try in {every}; the bound is {fixed} MiB and {row} bytes for each row that the c
 
 
 def table(tallies: Sequence[Tally], minutes: float) -> str:
-    """The page of a run."""
+    """The table of a run."""
     lines = []
     for tally in tallies:
         slow = sum("took" in words for words in tally.failures)
@@ -379,10 +369,7 @@ def main() -> int:
         tallies.append(tally)
         print(f"{kind.name}: {tally.tries} tries, {dict(tally.outcomes)}", file=sys.stderr, flush=True)
         print("\n".join(tally.failures), end="\n" if tally.failures else "", file=sys.stderr, flush=True)
-    page = table(tallies, (time.process_time() - started) / 60)
-    if options.tries is None and not options.only and not options.first:
-        TABLE.write_text(page)
-    print(page)
+    print(table(tallies, (time.process_time() - started) / 60))
     return int(any(tally.failures for tally in tallies))
 
 

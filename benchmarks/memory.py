@@ -79,7 +79,6 @@ def chart(rows: Sequence[dict[str, str]]) -> LineChart:
             series("the cap", "cap", True),
         ),
         log_x=True,
-        log_y=True,
     )
 
 

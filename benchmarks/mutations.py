@@ -1,7 +1,7 @@
 """Mutation testing: plants one fault at a time in a copy of the kernels and shows which test fails.
 
-    python -m benchmarks.mutations                    # all, and writes docs/results/mutations.md
-    python -m benchmarks.mutations --only conic -v    # only faults whose name contains a word; writes nothing
+    python -m benchmarks.mutations                    # all: a quarter of an hour
+    python -m benchmarks.mutations --only conic -v    # only faults whose name contains a word
 
 The twins stay as they are, so the comparison with them sees every fault by construction. The tests against the float64
 reference count, because it knows neither kernels nor twins. (The coder's kernels have no such reference; they are compared
@@ -21,10 +21,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.harness import ROOT, SCENES
+from benchmarks.harness import ROOT
 from benchmarks.planted_faults import GOLDEN, MUTATIONS, Mutation, Tests
 
-TABLE = ROOT / "docs" / "results" / "mutations.md"
 SURVIVED = "survived"
 
 
@@ -85,7 +84,7 @@ def judge(place: Path, mutation: Mutation | None, tests: Tests, verbose: bool = 
 
 
 def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
-    """The page with all faults and the tests that see them."""
+    """All faults by the tests that see them."""
     seen: dict[str, list[str]] = {}
     drawn = [row for row in rows if row[0].tests.golden and row[0].form != "gpu" and row[0].file != "dequantize.cl"]
     golden = [bool(found[2]) for _, found in drawn]
@@ -93,15 +92,8 @@ def table(rows: list[tuple[Mutation, tuple[str | None, ...]]]) -> str:
         first = reference if mutation.reference else twins
         seen.setdefault(_test(first) if first and twins else SURVIVED, []).append(mutation.name)
     lines = [
-        "# Planted faults",
-        "",
-        f"{len(rows)} faults were planted in a copy of the OpenCL kernels, one at a time. Against the NumPy twins, which stay",
-        f"as they are, {sum(bool(found[1]) for _, found in rows)} of them turned a test red. A row gives the first test against",
-        "the float64 reference that turned red too, or the twins' test for faults that change no value, and the faults. Of",
-        f"{len(golden)} faults in drawing, {sum(golden)} also turn the golden renders of the fox scene red.",
-        "",
-        "`python -m benchmarks.mutations` makes this page in a quarter of an hour. `test_kernels_mutations.py` plants three",
-        "faults with every test run, and checks that the text of all is still in the kernels.",
+        f"Of {len(golden)} faults in drawing, {sum(golden)} turn the golden renders of the fox scene red.",
+        "The first test of each against the float64 reference, or of the twins for faults that change no value:",
         "",
         "| first test | faults |",
         "|---|---|",
@@ -118,13 +110,9 @@ def _test(name: str) -> str:
 def main() -> int:
     """Run the mutations; returns 1 if one survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", metavar="WORD", help="mutations whose name holds this word; the page is not written")
+    parser.add_argument("--only", metavar="WORD", help="mutations whose name holds this word")
     parser.add_argument("-v", "--verbose", action="store_true", help="a line for each mutation as it is done")
     options = parser.parse_args()
-    if not options.only and not (SCENES["fox"] / "golden.npz").is_file():
-        parser.error(
-            f"the page has a column for the fox scene, and there is none at {SCENES['fox']}: set FLEXGS_SCENES"
-        )
     chosen = [mutation for mutation in MUTATIONS if not options.only or options.only in mutation.name]
     with workplace() as place:
         for tests in dict.fromkeys(mutation.tests for mutation in chosen):
@@ -133,11 +121,7 @@ def main() -> int:
                 print(f"the tests fail on the kernels as they are: {healthy}", file=sys.stderr)
                 return 2
         rows = [(mutation, judge(place, mutation, mutation.tests, options.verbose)) for mutation in chosen]
-    page = table(rows)
-    if options.only:
-        print(page)
-    else:
-        TABLE.write_text(page)
+    print(table(rows))
     survivors = [m.name for m, found in rows if not found[1] or (m.reference and not found[0])]
     print(f"{len(rows)} faults, {len(survivors)} survived" + "".join(f"\n  {name}" for name in survivors))
     return 1 if survivors else 0

@@ -10,12 +10,7 @@ from benchmarks.harness import ROOT
 from flexgs_edge.report.plots import LineChart, Series, picture
 
 IMAGE = ROOT / "docs" / "images" / "presets.png"
-LABELS = {
-    "compress --method paper": "paper",
-    "compress --effort fast": "fast",
-    "compress": "balanced",
-    "compress --effort max": "max",
-}
+LABELS = {"compress --method paper": "paper", "compress --effort fast": "fast", "compress": "balanced"}
 """What each command of `EFFORTS` is called in the chart, the fastest first."""
 
 
@@ -40,7 +35,6 @@ def chart(rows: list[Row]) -> LineChart:
         "times smaller than the PLY",
         tuple(series),
         log_x=True,
-        log_y=True,
     )
 
 

@@ -52,7 +52,6 @@ def compress(words: str, output: str = "out.fgs", scene: str = SCENE, views: str
 COMMANDS = {
     "fast": compress("--effort fast --report page"),
     "balanced": compress("", views=""),
-    "max": compress("--effort max"),
     "size": compress("--effort fast --max-size 40kB"),
     "ratio": compress("--effort fast --min-ratio 250 --no-refit"),
     "fidelity": compress("--effort fast --min-fidelity 36 --select train --extent inria --background white"),
@@ -68,7 +67,7 @@ COMMANDS = {
     "compressed": compress("--effort fast", "out.compressed.ply"),
     "paper-fast": compress("--method paper --effort fast --score-cache cache.npz"),
     "paper-balanced": compress("--method paper --score-cache ../paper-fast/cache.npz"),
-    "paper-max": compress("--method paper --effort max --score-cache ../score/scores.npz --max-drop 0.5"),
+    "paper-half": compress("--method paper --score-cache ../score/scores.npz --max-drop 0.5"),
     "paper-max-size": compress("--method paper --effort fast --max-size 300kB --score meson"),
     "paper-auto-bits": compress("--method paper --effort fast --bits auto --min-fidelity 33"),
     "paper-rates": compress("--method paper --prune-rate 0.3 --sh-rate 0.4 --bits rest=3,dc=7 --groups 50"),

@@ -2,7 +2,7 @@
 
 python -m benchmarks.self_test record           # after a kernel's results have changed: writes flexgs_edge/kernels/self_test.bin
 python -m benchmarks.self_test check            # whether the twins, and all forms of the kernels, give the record
-python -m benchmarks.self_test mutations        # one operator changed at a time; writes docs/results/self_test.md
+python -m benchmarks.self_test mutations        # one operator changed at a time
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness import ROOT
-from benchmarks.self_test_faults import Fault, faults, judge, judge_all
+from benchmarks.self_test_faults import faults, judge, judge_all
 from benchmarks.self_test_scene import BLOCKS, code_all, draw_all
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import choose_device, list_devices
@@ -30,7 +29,6 @@ from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.self_test import PATTERN, Arrays, verdict
 from flexgs_edge.memory.budget import MemoryBudget
 
-TABLE = ROOT / "docs" / "results" / "self_test.md"
 LEAST_REFUSED = 0.95
 """Share of the faults that the self-test must refuse."""
 FORMS = {
@@ -222,7 +220,7 @@ REASONS = {
 
 
 def mutations(only: str | None, workers: int, verbose: bool) -> int:
-    """Plant every fault, and write the page; returns 1 if fewer are refused than asked for."""
+    """Plant every fault; returns 1 if fewer are refused than asked for."""
     chosen = [fault for fault in faults() if only is None or only in f"{fault.file} {fault.function}"]
     with tempfile.TemporaryDirectory(prefix="self-test-") as name:
         for form in FORMS:
@@ -235,39 +233,9 @@ def mutations(only: str | None, workers: int, verbose: bool) -> int:
     share = 1 - len(passed) / max(len(rows), 1)
     print(f"{len(rows)} faults, {len(rows) - len(passed)} refused ({share:.1%})")
     for fault in passed:
-        print(f"  {fault.file}:{fault.line} {fault.function}: {fault.words()}")
-    if only is None:
-        TABLE.write_text(page(rows))
+        why = REASONS.get((fault.file, fault.function, fault.old), "unknown")
+        print(f"  {fault.file}:{fault.line} {fault.function}: {fault.words()}: {why}")
     return int(share < LEAST_REFUSED)
-
-
-def page(rows: list[tuple[Fault, str, str]]) -> str:
-    """The page about all faults."""
-    passed = [fault for fault, _, said in rows if said == "passed"]
-    share = 1 - len(passed) / len(rows)
-    files = sorted({fault.file for fault, _, _ in rows})
-    lines = [
-        "# Faults that the self-test sees",
-        "",
-        f"{len(rows)} faults were planted in a copy of the kernels, one at a time: one operator of every helper and",
-        "three of every kernel, at even distances in its text. The [self-test](../devices.md#the-self-test) refuses",
-        f"{len(rows) - len(passed)} of them ({share:.1%}). A fault counts as refused if a form that has the code refuses it.",
-        "",
-        "`nice python -m benchmarks.self_test mutations` makes this page.",
-        "",
-        "| file | faults | refused |",
-        "|---|---|---|",
-    ]
-    for file in files:
-        own = [fault for fault, _, _ in rows if fault.file == file]
-        lines.append(f"| `{file}` | {len(own)} | {len(own) - sum(fault.file == file for fault in passed)} |")
-    lines += ["", "## Those that pass", "", "| kernel or helper | change | why |", "|---|---|---|"]
-    for fault in passed:
-        words = fault.words().replace("|", "\\|")
-        lines.append(
-            f"| `{fault.function}` | {words} | {REASONS.get((fault.file, fault.function, fault.old), 'unknown')} |"
-        )
-    return "\n".join(lines) + "\n"
 
 
 def main() -> int:
@@ -275,7 +243,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("record", "check", "mutations", "play"))
     parser.add_argument("--form", default="w16", choices=FORMS, help="for play: the form of the kernels")
-    parser.add_argument("--only", metavar="WORD", help="for mutations: files and functions with this word; no page")
+    parser.add_argument("--only", metavar="WORD", help="for mutations: files and functions with this word")
     parser.add_argument("--workers", type=int, default=1, help="for mutations: faults judged side by side")
     parser.add_argument("-v", "--verbose", action="store_true", help="for mutations: a line for each fault")
     options = parser.parse_args()

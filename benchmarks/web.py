@@ -1,4 +1,4 @@
-"""Times the decoder in Node and in Chromium, and the viewer over a slow line: docs/results/web.md.
+"""Times the decoder in Node and in Chromium, and the viewer over a slow line: docs/viewer.md.
 
 python -m benchmarks.web [--scene fox|sample] [--repeats N]
 

@@ -77,6 +77,8 @@ class CompressWords(TypedDict, total=False):
     refit: bool
     distil: int | None
     spz_version: int
+    recenter: bool
+    force_lossy: bool
     layers: int | None
     preview: int | None
     scratch: str | None

@@ -125,7 +125,7 @@ Several scenes:
     metavar="WORD",
     type=click.Choice(["fast", "balanced", "max"]),
     default="balanced",
-    help="fast, balanced or max. More effort: smaller files, slower.",
+    help="fast or balanced: smaller files, slower. max is another word for balanced.",
 )
 @option(
     MACHINES,
@@ -150,6 +150,7 @@ Several scenes:
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")
 @option(OUTPUT, "--format", metavar="SUFFIX", help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.")
 @shared_options.spz_version_option
+@shared_options.positions_options
 @option(
     OUTPUT,
     "--layers",

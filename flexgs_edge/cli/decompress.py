@@ -17,28 +17,32 @@ from flexgs_edge.cli import help_page, shared_options, talk
     required=True,
     help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
 )
-@help_page.option(
-    help_page.OUTPUT,
-    "--force-lossy",
-    is_flag=True,
-    help="Write a scene far from zero also where the format's position error is more than a tenth of the smallest splat.",
-)
+@shared_options.positions_options
 @shared_options.spz_version_option
+@help_page.option(
+    help_page.VIEWS,
+    "--cameras",
+    metavar="PATH",
+    help="Cameras of the pictures that show what another program's format loses. none: no pictures. Default: cameras beside "
+    "the scene, else generated views.",
+)
 @shared_options.reading_options
 @help_page.option(
     help_page.DEVICE,
     "--device",
     metavar="SPEC",
-    help="OpenCL CPU that decodes a large .fgs of --method best: its number, part of its name, or cpu. numpy: the same "
-    "bits, slower. Default: the first CPU for a large scene, else numpy.",
+    help="Device that draws the compared pictures; an OpenCL CPU also decodes a large .fgs of --method best. Its number, part "
+    "of its name, or cpu. numpy: the same bits, slower. Default: as `devices` says, and a CPU for large files.",
 )
 @shared_options.memory_option
 @shared_options.write_options
 def command(
     input: str,
     output: str,
+    recenter: bool,
     force_lossy: bool,
     spz_version: int,
+    cameras: str | None,
     frame: str | None,
     lod: int | None,
     sh_degree: int | None,
@@ -56,8 +60,8 @@ def command(
     A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats, little endian.
     Gaussians without view-dependent colour get zeros for it.
 
-    Formats of other programs round values in their own ways. To make such a file smaller, and to see what is lost, use
-    compress.
+    Formats of other programs round values in their own ways. What that loses is measured and printed. To make such a file
+    smaller, use compress.
 
     FOLDER/lod-meta.json is streamed SOG, which PlayCanvas and SuperSplat load step by step: each layer of a .fgs of compress
     --layers becomes a level of detail.
@@ -75,5 +79,7 @@ def command(
     from flexgs_edge.io.reading import Reading
 
     reading = Reading.of(frame, lod, sh_degree)
-    result = decompress(input, output, force, memory_limit, device, reading, spz_version, force_lossy)
+    result = decompress(
+        input, output, force, memory_limit, device, reading, spz_version, force_lossy, recenter, cameras
+    )
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -36,6 +36,21 @@ reading_options = stack(
 spz_version_option = option(
     OUTPUT, "--spz-version", metavar="3|4", type=int, default=3, help="Version of a .spz. Older programs read only 3."
 )
+positions_options = stack(
+    option(
+        OUTPUT,
+        "--recenter",
+        is_flag=True,
+        help="Other programs' formats: move a scene far from zero to zero, and write the offset beside the file "
+        "(OUT.offset.json).",
+    ),
+    option(
+        OUTPUT,
+        "--force-lossy",
+        is_flag=True,
+        help="Other programs' formats: write positions that the format cannot hold, rounded. Default: refuse.",
+    ),
+)
 cameras_option = stack(
     option(
         VIEWS,

@@ -12,6 +12,7 @@ from typing import Any
 
 from flexgs_edge.goals.promise import in_the_way, kept_promise
 from flexgs_edge.goals.steps import SearchResult
+from flexgs_edge.io.exchange import write_offset
 from flexgs_edge.methods.best import method as best
 from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
@@ -64,6 +65,8 @@ def compress(
             run = check_views(run, context, options.trust_views)
         made = method.compress(run, context)
         result = _result(run, context, made)
+    if run.output.path is not None and run.output.format is not None and run.output.offset is not None:
+        LOG.info(write_offset(run.output.path, run.output.offset, run.output.format, options.force))
     if run.reporter is not None:
         if run.output.path is not None:
             run.reporter.read_contents(run.output.path)

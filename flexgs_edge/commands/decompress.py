@@ -7,13 +7,23 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v2.container import GridContainer, Preview
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_folder, check_writable
-from flexgs_edge.io.exchange import write_foreign, write_streamed
+from flexgs_edge.io.exchange import (
+    MovedSource,
+    check_positions,
+    offset_place,
+    write_foreign,
+    write_offset,
+    write_streamed,
+)
 from flexgs_edge.io.formats import FORMATS, WRITTEN, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
@@ -21,9 +31,11 @@ from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.conversion import conversion_loss
 from flexgs_edge.run.decoding import ahead, decode_bytes, decoded_once, decoder
-from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
+from flexgs_edge.run.inputs import LOG, CheckedScene, ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
+from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
 from flexgs_edge.run.spent import run_info
 from flexgs_edge.scene.source import SceneSource
 
@@ -31,6 +43,8 @@ WRITE_COPIES = 3
 """Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
 SPARE_SHARE = 8
 """Of what decoding takes, one part in so many is left free beside rows of a PLY: docs/results/tuning.md#heap"""
+WARN_DROP = 0.5
+"""We warn of a conversion whose pictures lose more than this, dB."""
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
 
 
@@ -43,6 +57,8 @@ def decompress(
     reading: Reading = AS_WRITTEN,
     spz_version: int = 3,
     force_lossy: bool = False,
+    recenter: bool = False,
+    cameras: str | None = None,
 ) -> DecompressResult:
     """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
 
@@ -63,9 +79,14 @@ def decompress(
     spz_version : {3, 4}
         Version of a `.spz`.
     force_lossy : bool
-        Write positions far from zero also where their error is more than a tenth of the smallest splat.
+        Write a scene also where the format cannot hold its positions, see `check_positions`.
+    recenter : bool
+        Move a scene that lies far from zero to zero, and write the offset beside `output` (other programs' formats).
+    cameras : str, optional
+        Cameras of the pictures that tell what another program's format loses; `none`: no pictures. Default: those beside the
+        scene, else generated ones.
     device : str, optional
-        Device that decodes: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
+        Device that decodes and draws: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
 
     Returns
     -------
@@ -87,12 +108,24 @@ def decompress(
         check_folder(Path(output).parent, force)
     else:
         check_writable(output, force)
+    if format is None and (recenter or force_lossy):
+        raise InputError(
+            f"--{'recenter' if recenter else 'force-lossy'}: a .ply holds the scene as it is; leave it out, or write one of "
+            f"{', '.join(WRITTEN)}"
+        )
+    if cameras not in (None, AUTO_CAMERAS, NO_CAMERAS):
+        read_cameras(cameras)
     writing = Writing(spz_version, force_lossy=force_lossy)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
         scene = load_scene(input, reading=reading)
         budget.take("reading the scene", scene.held_bytes)
+        recenter = recenter and bool(np.any(scene.source.origin))
+        if recenter:
+            check_writable(offset_place(output), force)
+        written = MovedSource(scene.source, np.zeros(3)) if recenter else scene.source
+        warnings = check_positions(written, format, force_lossy) if format is not None else ()
     antialiased = scene.settings.get("antialiased") is True
     backend = decoder(device, scene.source, budget, clock)
     with clock.stage("write"):
@@ -100,6 +133,8 @@ def decompress(
             needed = format.memory * scene.source.count
             budget.require(f"writing a {format.suffix}", needed)
             source = decoded_once(scene.source, budget, needed, backend)
+            scene = replace(scene, source=source)
+            source = MovedSource(source, np.zeros(3)) if recenter else source
             writing = replace(writing, antialiased=antialiased)
             if streamed:
                 layers, preview = _layers(input, source.count, reading)
@@ -115,10 +150,26 @@ def decompress(
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+        if recenter:
+            assert format is not None
+            notes = (*notes, write_offset(output, scene.source.origin, format, force))
         if antialiased and not (format is not None and format.marks_antialiased):
             notes = (*notes, ANTIALIASED_NOTE)
     size = _written_bytes(Path(output)) if streamed else os.stat(output).st_size
-    return DecompressResult(scene_info(scene), os.fspath(output), size, run_info(budget, clock, backend), notes)
+    loss = None
+    if format is not None:
+        options = ViewOptions(cameras=cameras, device=device, memory_limit=memory_limit)
+        with clock.stage("compare"):
+            loss = conversion_loss(scene, output, options, ordered=not streamed, recentred=recenter)
+        if loss.drop is not None and loss.drop > WARN_DROP:
+            warnings += (
+                f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; a .ply or a .fgs "
+                "loses none",
+            )
+    for warning in warnings:
+        LOG.warning("warning: %s", warning)
+    info = run_info(budget, clock, backend)
+    return DecompressResult(scene_info(scene), os.fspath(output), size, info, notes, loss, warnings)
 
 
 def _layers(input: ScenePlace, count: int, reading: Reading) -> tuple[tuple[int, ...], SceneSource | None]:

@@ -67,7 +67,7 @@ def view(
         check_writable(output, force)
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: expected 0 to 65535")
-    run = open_run(input, replace(options or ViewOptions(), **words), progress, photos=False)
+    run = open_run(input, replace(options or ViewOptions(), **words), progress, photos=False, decodes=False)
     run.budget.require("the program", 0)
     cameras = [] if run.views is None else list(run.views.cameras)
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}

@@ -10,7 +10,7 @@ from flexgs_edge.goals.promise import Promised, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
 MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
-REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 32}  # Measured points of the refinement for each `--effort`
+REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 10}  # Measured points of the refinement for each `--effort`
 
 
 @dataclass(frozen=True, order=True)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_folder, atomic_write, check_readable
+from flexgs_edge.io.codes import opacities
+from flexgs_edge.io.compressed_ply import CHUNK
 from flexgs_edge.io.formats import FORMATS, Format, format_of, written_format
 from flexgs_edge.io.frames import in_frame
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
@@ -19,6 +23,8 @@ from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
+_FINER = 10.0
+"""A scene is too far from zero for a format if its positions would be so many times finer at zero."""
 _FAR = 16.0
 """Rows further than so many median distances from the median centre are far."""
 
@@ -80,10 +86,8 @@ def write_foreign(
     assert format is not None
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {path}")
-    world = _WorldSource(without_degrees(source, format.max_degree), keep_origin=format.digits is None)
-    _check_reach(path, world, format)
-    if not writing.force_lossy:
-        _check_digits(path, source, format)
+    check_positions(source, format, writing.force_lossy)
+    world = _WorldSource(without_degrees(source, format.max_degree), format.keeps_origin)
     with atomic_write(path, force) as file:
         format.write(file, in_frame(world.select(near_order(source)), format.frame), writing)
     return _notes(source, format)
@@ -105,9 +109,8 @@ def write_streamed(
     format = FORMATS[".sog"]
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {folder}")
+    check_positions(source, format, writing.force_lossy)
     world = _WorldSource(without_degrees(source, format.max_degree))
-    if not writing.force_lossy:
-        _check_digits(folder, source, format)
     with atomic_folder(folder, force) as place:
         small = None if preview is None else in_frame(_WorldSource(preview), format.frame)
         write_streamed_sog(place, in_frame(world, format.frame), layers, writing, small)
@@ -118,7 +121,7 @@ def _notes(source: SceneSource, format: Format) -> tuple[str, ...]:
     notes: tuple[str, ...] = ()
     if source.sh_degree > format.max_degree:
         notes = (f"SH above degree {format.max_degree} left out: {format.suffix} holds no others",)
-    if np.any(source.origin != 0) and format.digits is not None:
+    if np.any(source.origin != 0) and not format.keeps_origin:
         notes += ("positions rounded to float32: the scene is far from zero",)
     return notes
 
@@ -131,7 +134,8 @@ def written_order(source: SceneSource) -> np.ndarray:
 def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     """[N] i64, the rows along a Morton curve through the box of the scene, far ones last, by octaves of their distance.
 
-    Formats whose chunks share a range would else lose the digits of near rows to far ones beside them.
+    Formats whose chunks share a range would else lose the digits of near rows to far ones beside them. One chunk has rows of
+    both kinds: its near ones are the faintest.
     """
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
     order = near_rows(means)
@@ -141,39 +145,126 @@ def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     if not 0 < limit < np.max(distances):
         return order
     octaves = np.maximum(np.frexp(distances / limit)[1], 0)
+    near = np.flatnonzero(octaves == 0)
+    mixed = near.size % CHUNK
+    if mixed:
+        octaves[near[np.argsort(_areas(source, near), kind="stable")[:mixed]]] = 1
+        octaves[distances > limit] += 1
     found: np.ndarray = order[np.argsort(octaves[order], kind="stable")]
     return found
 
 
-def _check_reach(path: str | os.PathLike[str], source: SceneSource, format: Format, chunk_rows: int = 65536) -> None:
-    if np.isinf(format.reach):
-        return
+def _areas(source: SceneSource, rows: np.ndarray) -> np.ndarray:
+    """[n] f64, opacity times the square of the largest scale, scene units."""
+    planes = source.read(rows, ["opacity_logits", "log_scales"])
+    with np.errstate(over="ignore"):
+        areas: np.ndarray = opacities(planes["opacity_logits"][0]) * np.exp(2.0 * planes["log_scales"].max(axis=0))
+    return areas
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """What a format's positions lose of a scene, known before it is written.
+
+    Parameters
+    ----------
+    moved : int
+        Gaussians that rounding moves by more than their own size, that is their largest deviation.
+    error, smallest : float
+        Largest error of a position, and the size of the smallest splat, scene units.
+    """
+
+    moved: int
+    error: float
+    smallest: float
+
+
+def rounding_of(source: SceneSource, format: Format, chunk_rows: int = 65536) -> Rounding:
+    """What a format does to the positions of a scene. Raises `InputError` for coordinates beyond its reach."""
+    origin = np.zeros(3) if format.keeps_origin else np.asarray(source.origin)
+    largest, beyond = np.zeros(3), 0
     for rows in source.chunks(chunk_rows):
-        means = source.read(rows, ["means"])["means"]
-        far = np.flatnonzero(~(np.abs(means) <= format.reach).all(axis=0))
-        if far.size:
-            raise InputError(
-                f"{path}: {format.suffix} holds coordinates up to {format.reach:.0f}; row {rows.start + far[0]} of {source.name} "
-                f"lies at {', '.join(f'{v:g}' for v in means[:, far[0]])}: write a .ply, or move the scene to zero first"
-            )
-
-
-def _check_digits(path: str | os.PathLike[str], source: SceneSource, format: Format, chunk_rows: int = 65536) -> None:
-    """Refuse a scene far from zero whose positions the format cannot hold to a tenth of the smallest splat."""
-    if format.digits is None or not np.any(source.origin):
-        return
-    largest, smallest = 0.0, np.inf
+        sizes = np.abs(source.read(rows, ["means"])["means"] + origin[:, None])
+        largest = np.maximum(largest, sizes.max(axis=1))
+        beyond += int(np.count_nonzero(~(sizes <= format.reach).all(axis=0)))
+    if beyond:
+        raise InputError(
+            f"{source.name}: {beyond} of {source.count} Gaussians lie beyond {format.reach:.0f}, the largest coordinate that "
+            f"{format.suffix} holds; the farthest at {largest.max():g}: write a .fgs, .ply or .glb, or move the scene to zero"
+        )
+    moved, error, smallest = 0, 0.0, np.inf
     for rows in source.chunks(chunk_rows):
         planes = source.read(rows, ["means", "log_scales"])
-        largest = max(largest, float(np.max(np.abs(planes["means"] + source.origin[:, None]))))
-        smallest = min(smallest, float(np.exp(np.max(planes["log_scales"].astype(np.float64), axis=0)).min()))
-    error = float(np.ldexp(0.5, int(np.frexp(largest)[1]) - format.digits))
-    if error > smallest / 10:
+        errors = format.position_error(planes["means"] + origin[:, None], float(largest.max()))
+        with np.errstate(over="ignore"):
+            sizes = np.exp(np.max(planes["log_scales"].astype(np.float64), axis=0))
+        moved += int(np.count_nonzero(errors > sizes))
+        error, smallest = max(error, float(errors.max())), min(smallest, float(sizes.min()))
+    return Rounding(moved, error, smallest)
+
+
+def check_positions(source: SceneSource, format: Format, force_lossy: bool = False) -> tuple[str, ...]:
+    """Refuse a scene whose positions a format cannot hold, and warn of Gaussians that it moves.
+
+    Of a scene far from zero, every position is held to a tenth of the smallest splat, or nearly as well as at zero. Of
+    others, most Gaussians move by less than their own size.
+
+    Returns
+    -------
+    tuple of str
+        Warnings: empty, or how many Gaussians move by more than their own size.
+    """
+    found = rounding_of(source, format)
+    too_coarse = found.error > found.smallest / 10 and bool(np.any(source.origin)) and not force_lossy
+    if too_coarse and found.error > _FINER * rounding_of(MovedSource(source, np.zeros(3)), format).error:
         raise InputError(
-            f"{path}: {format.suffix} holds coordinates of {largest:.0f} only to {error:.2g}, and the smallest splat of "
-            f"{source.name} measures {smallest:.2g}: write a .glb or a .ply, move the scene to zero first, or use "
-            "decompress --force-lossy"
+            f"{source.name}: {format.suffix} holds these coordinates only to {found.error:.2g}, and the smallest splat "
+            f"measures {found.smallest:.2g}: use --recenter, which writes the offset beside the file, write a .glb or a .fgs, "
+            "or use --force-lossy"
         )
+    if not found.moved:
+        return ()
+    words = (
+        f"{found.moved} of {source.count} Gaussians move by more than their own size, since {format.suffix} rounds positions of "
+        f"this scene by up to {found.error:.2g}"
+    )
+    if 2 * found.moved > source.count and not force_lossy:
+        raise InputError(
+            f"{source.name}: {words}. Write a .fgs, .ply or .glb, leave out what lies far away, or use --force-lossy"
+        )
+    return (words,)
+
+
+def offset_place(path: str | os.PathLike[str]) -> Path:
+    """The file beside `path` that holds the offset of a scene that was moved to zero."""
+    return Path(path).with_name(Path(path).name + ".offset.json")
+
+
+def write_offset(path: str | os.PathLike[str], origin: np.ndarray, format: Format, force: bool) -> str:
+    """Write how far a scene was moved, in the axes of the file at `path`. Returns a note.
+
+    Raises
+    ------
+    InputError
+        If the offset's file exists and `force` is not set.
+    """
+    place, offset = offset_place(path), (origin * format.frame.signs + 0.0).tolist()
+    with atomic_write(place, force) as file:
+        file.write(json.dumps({"offset": offset, "axes": format.frame.name}, indent=1).encode() + b"\n")
+    return f"moved to zero: add the offset in {place}"
+
+
+class MovedSource(SceneSource):
+    """A scene that is moved as a whole: the same values around another origin."""
+
+    def __init__(self, parent: SceneSource, origin: np.ndarray) -> None:
+        self.parent, self.name, self.notes, self.origin = parent, parent.name, parent.notes, origin
+        self.count, self.sh_degree, self.sh_count = parent.count, parent.sh_degree, parent.sh_count
+        self.settings, self.held_bytes, self.valid = parent.settings, parent.held_bytes, parent.valid
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`."""
+        return self.parent.read(rows, fields, out)
 
 
 class _WorldSource(SceneSource):

@@ -9,8 +9,27 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame
+
+
+def _as_float32(means: np.ndarray, largest: float) -> np.ndarray:
+    """Half a step of float32 at each position."""
+    errors: np.ndarray = np.ldexp(0.5, np.frexp(np.abs(means).max(axis=0))[1] - 24)
+    return errors
+
+
+def _fixed_point(means: np.ndarray, largest: float) -> np.ndarray:
+    """Half a step of signed integers of 24 bits: one step for all positions."""
+    return np.full(means.shape[1], np.ldexp(0.5, np.frexp(largest)[1] - 23))
+
+
+def _logarithmic(means: np.ndarray, largest: float) -> np.ndarray:
+    """Half a step of 16 bits over the logarithms of both signs: it grows with the distance from zero."""
+    errors: np.ndarray = (1 + np.abs(means).max(axis=0)) * (np.log1p(largest) / 65535)
+    return errors
 
 
 @dataclass(frozen=True)
@@ -31,16 +50,16 @@ class Format:
         Directions of the axes in files of this format.
     reach : float
         Largest coordinate that it holds, scene units.
-    digits : int or None
-        Binary digits of world coordinates; `None`: it holds the origin apart, in float64.
+    position_error : callable
+        From positions [3, n] f64 and the largest coordinate of the scene to the largest errors [n] f64 of a coordinate, at least.
+    keeps_origin : bool
+        It holds the origin of a scene far from zero apart, in float64.
     max_degree : int
         Highest SH degree.
-    one_degree : bool
-        Only a lower SH degree of the whole scene saves bytes; SH that are zero take as much as others.
-    row_bytes : float
-        Approximate bytes of a Gaussian of SH degree 3, where searches start.
-    sh_bytes : float
-        Bytes of SH among them.
+    fixed_rows : bool
+        All rows take the same bytes: neither coarser values nor SH of zero save any.
+    row_bytes, sh_bytes : float
+        Bytes of a fixed row of SH degree 3, and of SH among them.
     memory : int
         Most bytes a Gaussian that writing and reading back hold.
     marks_antialiased : bool
@@ -52,11 +71,12 @@ class Format:
     writer: str | None = None
     frame: Frame = RDF
     reach: float = float("inf")
-    digits: int | None = 24
+    position_error: Callable[[np.ndarray, float], np.ndarray] = _as_float32
+    keeps_origin: bool = False
     max_degree: int = 3
-    one_degree: bool = False
-    row_bytes: float = 20.0
-    sh_bytes: float = 5.0
+    fixed_rows: bool = False
+    row_bytes: float = 0.0
+    sh_bytes: float = 0.0
     memory: int = 512
     marks_antialiased: bool = False
 
@@ -87,27 +107,27 @@ FORMATS: dict[str, Format] = {
     for format in (
         Format(
             ".spz", f"{_IO}.spz:read_spz", f"{_IO}.spz_writer:write_spz", RUB, reach=2.0**23 - 1,
-            digits=23, max_degree=4, row_bytes=22.0, sh_bytes=5.5, marks_antialiased=True,
+            position_error=_fixed_point, max_degree=4, marks_antialiased=True,
         ),
         Format(
             ".sog", f"{_IO}.sog:read_sog", f"{_IO}.sog_writer:write_sog",
-            row_bytes=24.0, sh_bytes=11.0, memory=1024, marks_antialiased=True,
+            position_error=_logarithmic, memory=1024, marks_antialiased=True,
         ),
         Format("lod-meta.json", f"{_IO}.streamed_sog:read_streamed_sog"),
         Format("meta.json", f"{_IO}.sog:read_sog_folder"),
         # 16 bytes, 45 bytes of SH, and 72 bytes for each chunk of 256 rows.
         Format(
             ".compressed.ply", f"{_IO}.compressed_ply:read_compressed_ply", f"{_IO}.compressed_ply:write_compressed_ply",
-            one_degree=True, row_bytes=61.3, sh_bytes=45.0,
+            fixed_rows=True, row_bytes=61.3, sh_bytes=45.0,
         ),
         Format(
             ".splat", f"{_IO}.splat:read_splat", f"{_IO}.splat:write_splat",
-            max_degree=0, one_degree=True, row_bytes=32.0, sh_bytes=0.0,
+            max_degree=0, fixed_rows=True, row_bytes=32.0, sh_bytes=0.0,
         ),
         Format(".ksplat", f"{_IO}.ksplat:read_ksplat"),
         Format(
             ".glb", f"{_IO}.gltf:read_gltf", f"{_IO}.glb_writer:write_glb", LUF,
-            digits=None, one_degree=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
+            keeps_origin=True, fixed_rows=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
         ),
         Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
     )

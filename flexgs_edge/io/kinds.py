@@ -115,7 +115,7 @@ def _ply_kind(header: PlyHeader) -> Kind:
     if "packed_position" in has:
         return Kind("a compressed PLY", suffix=".compressed.ply")
     moving = sorted(name for name in has if _MOVING.fullmatch(name))
-    if moving and "opacity" in has:
+    if moving not in ([], ["t"]) and "opacity" in has:  # `t` alone may be anything
         return Kind(
             f"a PLY of Gaussians that move (4D: {', '.join(moving[:4])})",
             "this program reads scenes that stand still; export one moment of it as a plain PLY with the program that trained it",

@@ -37,7 +37,7 @@ class Writing:
 
     spz_version: int = 3  # Version of a `.spz`. Older programs read only 3.
     antialiased: bool = False  # the model is antialiased; formats that can say so, do
-    # Write positions far from zero also where their error is more than a tenth of the smallest splat.
+    # Write a scene also where the format cannot hold its positions: see `check_positions`.
     force_lossy: bool = False
 
     def __post_init__(self) -> None:

@@ -195,8 +195,10 @@ class QuantizedPlanes:
                 codes, low, step, plane,
             )  # fmt: skip
             if name == "means" and self._contraction is not None:
-                with self.backend.mapped(plane) as host:
-                    host[:, :rows] = self._contraction.expand(host[:, :rows])
+                # A map would not wait for the kernel.
+                host = self.backend.read(plane)
+                host[:, :rows] = self._contraction.expand(host[:, :rows])
+                self.backend.write(plane, host)
 
     def close(self) -> None:
         """Free codes and ranges."""

@@ -15,14 +15,67 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class ConversionLoss:
+    """What a file in another program's format lost of its scene.
+
+    Parameters
+    ----------
+    values : dict of str to tuple of float
+        Median and largest errors of positions (scene units, and over the splat's size), log-scales, opacities and colours.
+    views : int
+        Views that were compared, drawn by `cameras`.
+    fidelity, worst : float or None
+        PSNR of the file's pictures against the scene's, dB: mean and worst view; `None` if identical or not drawn.
+    drop : float or None
+        Modelled drop from `base_psnr`, dB.
+    why : str
+        Why no pictures were compared.
+    """
+
+    values: dict[str, tuple[float, float]]
+    views: int = 0
+    cameras: str = ""
+    fidelity: float | None = None
+    worst: float | None = None
+    drop: float | None = None
+    base_psnr: float | None = None
+    why: str = ""
+
+    def lines(self) -> list[str]:
+        """Lines of the summary."""
+        lines = []
+        if self.values:
+            median, most = self.values["position_by_size"]
+            opacity, colour = self.values["opacity"][1], self.values["colour"][1]
+            lines.append(
+                line(
+                    "values",
+                    f"positions move by {100 * median:.2g} % of a splat's size in the median, {100 * most:.2g} % at most; "
+                    f"opacities by up to {opacity:.2g}, colours by {colour:.2g}",
+                )
+            )
+        if not self.views:
+            return [*lines, line("pictures", f"not compared: {self.why}")]
+        same = (
+            "the same pictures"
+            if self.fidelity is None
+            else f"fidelity {self.fidelity:.2f} dB, worst {self.worst:.2f} dB"
+        )
+        lost = f"; modelled drop {self.drop:.3f} dB from a base of {self.base_psnr:g} dB"
+        return [*lines, line("pictures", f"{same}{lost} ({self.views} views, cameras from {self.cameras})")]
+
+
+@dataclass(frozen=True)
 class DecompressResult:
-    """Result of `decompress`: the file it wrote."""
+    """Result of `decompress`: the file it wrote, and for other programs' formats what they lost."""
 
     scene: SceneInfo
     output: str
     size: int
     run: RunInfo
     notes: tuple[str, ...] = ()
+    loss: ConversionLoss | None = None
+    warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
@@ -38,6 +91,7 @@ class DecompressResult:
                 "as large as" if self.size == self.scene.bytes else f"{times_words(self.scene.bytes / self.size)} than"
             )
             lines.append(line("size", f"{change} the input's {format_size(self.scene.bytes)}"))
+        lines += [] if self.loss is None else self.loss.lines()
         lines += [line("note", note) for note in self.notes]
         return text([*lines, *run_lines(self.run)])
 

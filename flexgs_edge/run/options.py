@@ -154,6 +154,8 @@ class CompressOptions(ViewOptions):
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
+    recenter: bool = False
+    force_lossy: bool = False
     layers: int | None = None
     preview: int | None = None
     scratch: str | None = None
@@ -183,9 +185,10 @@ class CompressOptions(ViewOptions):
         if self.groups is not None and self.groups < 1:
             raise InputError(f"--groups {self.groups}: expected 1 or more")
         check_method(self.method, [name for name in METHOD_ONLY if getattr(self, name) != METHOD_ONLY[name][1]])
-        if not self.refit and (self.distil or (self.effort == "max" and self.distil is None)):
-            word = f"--distil {self.distil}" if self.distil else "--effort max"
-            raise InputError(f"--no-refit with {word}: distilling is the larger refit; give one or the other")
+        if not self.refit and self.distil:
+            raise InputError(
+                f"--no-refit with --distil {self.distil}: distilling is the larger refit; give one or the other"
+            )
         if self.distil is not None and not 0 <= self.distil <= FINETUNE_MOST:
             raise InputError(f"--distil {self.distil}: expected 0 (none) to {FINETUNE_MOST} steps")
         if self.layers is not None and not 1 <= self.layers <= LAYERS_MOST:
@@ -233,7 +236,7 @@ class CompressOptions(ViewOptions):
     @property
     def writing(self) -> Writing:
         """How a file of another program's format is written."""
-        return Writing(self.spz_version, bool(self.antialiased))
+        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy)
 
     @property
     def unseen_share(self) -> float:

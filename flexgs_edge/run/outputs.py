@@ -6,8 +6,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
+from flexgs_edge.io.exchange import offset_place
 from flexgs_edge.io.formats import WRITTEN, Format, written_format
 from flexgs_edge.run.options import CompressOptions
 
@@ -18,6 +21,7 @@ class Output:
 
     path: Path | None = None  # the file to write; `None` in a dry run
     format: Format | None = None  # another program's format; `None` for a `.fgs`
+    offset: np.ndarray | None = None  # [3] f64, how far the scene was moved to zero; `None` if it was not
 
 
 NO_OUTPUT = Output()  # Of commands that write no scene
@@ -35,6 +39,8 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     if Path(output).suffix.lower() != ".fgs" and format is None:
         raise InputError(f"-o {output}: expected a name that ends in .fgs, {', '.join(WRITTEN)}")
     check_writable(output, options.force)
+    if options.recenter:
+        check_writable(offset_place(output), options.force)
     return Output(Path(output), format)
 
 
@@ -42,14 +48,12 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
     """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
     format = None if output is None else written_format(output)
     if format is None:
+        if options.recenter or options.force_lossy:
+            word = "recenter" if options.recenter else "force-lossy"
+            raise InputError(f"--{word}: a .fgs holds scenes far from zero as they are; leave it out")
         return None
     if options.method == "paper":
         raise InputError(f"--method paper writes .fgs files alone, not {format.suffix}; leave it out, or write a .fgs")
-    if options.distil:
-        raise InputError(
-            f"--distil {options.distil}: distilling ends on the grid of a .fgs, {format.suffix} has its own; "
-            "leave it out, or write a .fgs"
-        )
     if options.layers is not None and options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
     if options.preview:

@@ -6,8 +6,11 @@ import os
 from dataclasses import dataclass, replace
 from typing import Generic
 
+import numpy as np
+
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Target
+from flexgs_edge.io.exchange import MovedSource, check_positions
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import SILENT, Progress
@@ -84,6 +87,7 @@ def open_run(
     photos: bool = True,  # look for photos as well as for cameras
     judged_path: ScenePlace | None = None,
     given: GivenViews | None = None,  # cameras and photos from memory, instead of those that the options name
+    decodes: bool = True,  # the command decodes a `.fgs`; if not, nothing is read of it here either
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
 
@@ -109,8 +113,7 @@ def open_run(
             options, views = near_enough(options, views)
         if reporter is not None and views is not None:
             reporter.see_cameras(views, scene)
-        # A page shows a `.fgs` as it is: the browser decodes it, and we do not.
-        unread = not photos and scene.path is not None and is_fgs(scene_file(scene.path))
+        unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
         found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
@@ -138,7 +141,29 @@ def open_compression(
     """
     place = check_output(output, options)
     reporter = Reporter.maybe(options.report, options.force)
-    return replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
+    run = replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
+    with run.clock.stage("open"):
+        return _positioned(run)
+
+
+def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:
+    """The same run with a scene whose positions the format holds: moved to zero with its cameras, if the user asks for it."""
+    format, origin = run.output.format, run.source.origin
+    if format is None:
+        return run
+    if run.options.recenter and np.any(origin):
+        views = run.views
+        if views is not None:
+            moved = [
+                replace(camera, translation=camera.translation + camera.rotation @ origin) for camera in views.cameras
+            ]
+            views = replace(views, cameras=moved)
+        run = run.of_source(MovedSource(run.source, np.zeros(3)))
+        run = replace(run, views=views, output=replace(run.output, offset=origin))
+    warnings = check_positions(run.source, format, run.options.force_lossy)
+    for warning in warnings:
+        LOG.warning("warning: %s", warning)
+    return replace(run, warnings=(*run.warnings, *warnings))
 
 
 def _beside(place: ScenePlace) -> Companions:

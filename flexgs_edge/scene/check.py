@@ -76,15 +76,14 @@ def check_scene(source: SceneSource, drop_invalid: bool = False, chunk_rows: int
     if faults.count:
         note = f"{faults.count} of {source.count} Gaussians left out as invalid: {faults}"
         source = SelectSource(source, np.flatnonzero(keep), (note,))
-    if activated:
-        LOG.warning(
-            "%s: all %d opacities lie in 0..1 and all scales above 0, so they seem to be activated already. They are read as "
-            "logits and logarithms, as the format says: all Gaussians would be half transparent and larger than 1 unit. If the "
-            "scene looks wrong, write log(opacity / (1 - opacity)) and log(scale) to the file.",
-            source.name,
-            source.count,
-        )
     notes = []
+    if activated:
+        notes.append(
+            f"all {source.count} opacities lie in 0..1 and all scales above 0, so they seem to be activated already. They are "
+            "read as logits and logarithms, as the format says: all Gaussians would be half transparent and larger than 1 "
+            "unit. If the scene looks wrong, write log(opacity / (1 - opacity)) and log(scale) to the file"
+        )
+        LOG.warning("%s: %s", source.name, notes[0])
     if flat:
         if not np.isfinite(smallest):
             raise InputError(f"{source.name}: log_scales: all are -inf; expected finite values")

@@ -11,7 +11,7 @@ from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
 
 GROWTH_POWER = 0.125
 """Power by which scales grow with the number of rows that belong to a scene over those that are there:
-docs/results/web.md#layers"""
+docs/results/tuning.md#layers"""
 
 
 def growth(there: int, whole: int) -> np.float32:

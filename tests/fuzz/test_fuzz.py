@@ -1,4 +1,4 @@
-"""A part of the fuzzing of docs/results/fuzzing.md with every test run, and a folder of files that must be refused."""
+"""A part of the fuzzing of benchmarks/fuzz.py with every test run, and a folder of files that must be refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.damage import mutate_bytes, mutate_json, mutate_sealed, mutate_text
-from benchmarks.fuzz import BOUND, KINDS, SEEDS, SLOW, TABLE, Fuzzer, Kind, fuzz, read_container, read_other, read_views
+from benchmarks.fuzz import BOUND, KINDS, SEEDS, SLOW, Fuzzer, Kind, fuzz, read_container, read_other, read_views
 from flexgs_edge.codec.open_fgs import verify
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.io.formats import format_of
@@ -131,9 +131,3 @@ def test_mutations_change_things(mutate: object) -> None:
     data = (SEEDS / "cameras.json").read_bytes()
     made = {mutate(random.Random(number), data) for number in range(200)}  # type: ignore[operator]
     assert len(made) > 170
-
-
-def test_the_page_has_every_kind() -> None:
-    page = TABLE.read_text()
-    for kind in KINDS:
-        assert f"| {kind.name} |" in page

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 import pytest
 
-from benchmarks import figures, left_out
+from benchmarks import figures
 
 FENCE = re.compile(r"^ *```.*?^ *```", re.DOTALL | re.MULTILINE)
 SPAN = re.compile(r"`[^`\n]+`")
@@ -211,30 +211,3 @@ def test_a_changed_table_is_found() -> None:
     for broken in ("<!-- figures: effort -->\n", "<!-- figures: nothing -->\n<!-- end -->"):
         with pytest.raises(figures.Missing):
             figures.rewritten(broken, rows)
-
-
-def test_the_page_of_left_out_scenes_is_that_of_its_file(repository: Path) -> None:
-    results = repository / "docs" / "results"
-    assert (results / "left_out.md").read_text() == left_out.page(left_out.read_rows(results / "left_out.csv"))
-
-
-def test_a_left_out_scene_does_not_choose() -> None:
-    sizes = {"now": (100, 100, 100), "1": (90, 200, 95), "2": (120, 50, 130)}
-    rows = [
-        {
-            "constant": "now" if value == "now" else "keep",
-            "value": value,
-            "scene": scene,
-            "bytes": str(size),
-            "kept": "True",
-        }
-        for value, some in sizes.items()
-        for scene, size in zip("abc", some)
-    ]
-    page = left_out.page(rows)
-    # Without b, 1 is best in both others: twice the bytes of now there, and four times the least.
-    assert "| `keep` | b | 1 | +300.0% | +100.0% | kept |" in page
-    # Without a, 2 costs c 37 %, now costs b 100 %.
-    assert "| `keep` | a | 2 | +33.3% | +20.0% | kept |" in page
-    rows[-2]["kept"] = "False"  # the promise is broken on b with 2
-    assert "| `keep` | a | now | +11.1% | +0.0% | kept |" in left_out.page(rows)

@@ -186,5 +186,6 @@ def test_files_that_are_activated_already_are_warned_of(seen: str, caplog: pytes
         if seen in (name, "both"):
             data[name] = np.random.default_rng(1).uniform(0.001, 1, data[name].shape).astype(np.float32)
     with caplog.at_level("WARNING", "flexgs_edge"):
-        check_scene(MemorySource(data), chunk_rows=3)
+        notes = check_scene(MemorySource(data), chunk_rows=3).notes
+    assert any("activated already" in note for note in notes) == (seen == "both")
     assert ("all 40 opacities lie in 0..1 and all scales above 0" in caplog.text) == (seen == "both")

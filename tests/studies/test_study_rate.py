@@ -52,7 +52,7 @@ def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rate
     with pytest.MonkeyPatch.context() as patch:
         # One format of another program: the others go the same way.
         patch.setattr("flexgs_edge.studies.rate.points.PEERS", (".spz",))
-        found = study_rate(project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO], distilled=[RATIO])
+        found = study_rate(project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO])
     return found, out
 
 
@@ -68,7 +68,7 @@ def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Pa
         made = compress(
             project / "point_cloud.ply", None, replace(OPTIONS, method=method, promise="mean", **words), dry_run=True
         )
-        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant) and r["effort"] != "max")
+        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant))
         assert (row["size"], row["kept"]) == (made.size, made.count)
         assert made.quality is not None
         assert row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
@@ -88,8 +88,8 @@ def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene
 
 def test_points_keep_to_the_ratio(study: tuple[RateStudy, Path]) -> None:
     rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
-    assert [(row["variant"], row["effort"]) for row in rows] == [("whole", "fast"), ("whole", "max")]
-    assert all(float(str(row["ratio"])) >= RATIO for row in rows) and len({row["size"] for row in rows}) == 2
+    assert [(row["variant"], row["effort"]) for row in rows] == [("whole", "fast")]
+    assert all(float(str(row["ratio"])) >= RATIO for row in rows)
 
 
 def test_another_format_holds_the_whole_scene(
@@ -117,17 +117,13 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
     assert isinstance(chart, LineChart)
     drawn = {series.label: [round(1e6 * x) for x in series.x] for series in chart.series}
     rows = rows_of(study, "rate")
-    assert drawn["best"] + drawn["best, distilled"] == [
-        row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"
-    ]
+    assert drawn["best"] == [row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"]
     assert drawn["paper"] == [row["size"] for row in rows if row["method"] == "paper"]
     assert "Left out or not reached" not in result.to_text()
 
 
 def test_without_photos(project: Path, tmp_path: Path) -> None:
-    found = study_rate(
-        project / "point_cloud.ply", tmp_path / "out", replace(OPTIONS, images="none"), ratios=[RATIO], distilled=[]
-    )
+    found = study_rate(project / "point_cloud.ply", tmp_path / "out", replace(OPTIONS, images="none"), ratios=[RATIO])
     (experiment,) = found.scene.experiments
     assert isinstance(experiment.chart, LineChart) and "fidelity" in experiment.chart.y_label
     assert set(experiment.table.values("drop")) == {None} and None not in experiment.table.values("fidelity")
@@ -165,7 +161,6 @@ def test_a_chart_over_megabytes_has_a_log_axis_and_need_not_start_at_zero() -> N
         ({"ratios": [0.5]}, "--ratios 0.5: expected ratios of 1 or more"),
         ({"ratios": []}, "--ratios: expected one ratio or more"),
         ({"ratios": [math.nan]}, "--ratios nan"),
-        ({"distilled": [0.1]}, "--distilled 0.1: expected ratios of 1 or more"),
     ],
 )
 def test_ratios_are_checked_before_any_work(tmp_path: Path, words: dict[str, object], said: str) -> None:
@@ -188,10 +183,7 @@ def test_the_command_line_hands_on_what_it_is_told(
     with pytest.raises(SystemExit) as left:
         app.main([*words, "--json", "-"])
     assert left.value.code == 0
-    assert told == {
-        "ratios": (10.0, 20.0), "effort": "balanced", "scene": "a.ply",
-        "distilled": (32.0, 64.0, 128.0),
-    }  # fmt: skip
+    assert told == {"ratios": (10.0, 20.0), "effort": "balanced", "scene": "a.ply"}
     out = capsys.readouterr()
     assert json.loads(out.out)["command"] == "study rate" and "Bytes and fidelity" in out.err
     with pytest.raises(SystemExit) as left:
@@ -209,4 +201,3 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     # Written twice: the library is not loaded to show the help.
     defaults = {option.name: option.default for option in options}
     assert RATIOS.convert(defaults["ratios"], None, None) == rate.RATIOS
-    assert RATIOS.convert(defaults["distilled"], None, None) == rate.DISTILLED

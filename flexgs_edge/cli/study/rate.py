@@ -37,26 +37,13 @@ RATIOS = RatiosType()
 @help_page.option(
     "Points",
     "--effort",
-    type=click.Choice(["fast", "balanced", "max"]),
+    type=click.Choice(["fast", "balanced"]),
     default="balanced",
     help="Effort of the search at these ratios, as for compress.",
 )
-@help_page.option(
-    "Points",
-    "--distilled",
-    type=RATIOS,
-    default="32,64,128",
-    help="Ratios for --method best with --effort max, which is slow; none: skip this.",
-)
 @shared_options.study_options
 def command(
-    scene: str,
-    output: str,
-    ratios: tuple[float, ...],
-    distilled: tuple[float, ...],
-    json_path: str | None,
-    quiet: bool,
-    **options: Any,
+    scene: str, output: str, ratios: tuple[float, ...], json_path: str | None, quiet: bool, **options: Any
 ) -> None:
     """Chart bytes against quality for a scene.
 
@@ -71,12 +58,12 @@ def command(
     Examples:
       flexgs-edge study rate point_cloud.ply -o rate
       flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40
-      flexgs-edge study rate scene.ply -o rate --effort max --distilled none
+      flexgs-edge study rate scene.ply -o rate --effort fast
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
     from flexgs_edge.studies.rate.study import study_rate
 
     made = CompressOptions(**options)
-    result = study_rate(scene, output, made, progress, ratios=ratios, distilled=distilled)
+    result = study_rate(scene, output, made, progress, ratios=ratios)
     talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

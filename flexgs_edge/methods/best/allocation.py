@@ -58,7 +58,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
 def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
     """Keep the row whose removal costs most (of equal ones the first), if `keep` has none that a pose sees.
 
-    `keep`: [n] bool, from `choose` or `choose_one_degree`; changed in place. `costs`: squared errors.
+    `keep`: [n] bool, from `choose` or `OneDegree`; changed in place. `costs`: squared errors.
     """
     dearest, most = 0, -1.0
     for rows, (removal, weight2) in read_ahead(len(keep), costs.removal, costs.weight2):
@@ -74,7 +74,7 @@ def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
 def keep_most(keep: np.ndarray, costs: RemovalCosts, most: int) -> None:
     """Keep no more than `most` rows: first go those that no pose sees, then those whose removal costs least.
 
-    `keep`: [n] bool, from `choose` or `choose_one_degree`; changed in place. `costs`: squared errors. `most`: most
+    `keep`: [n] bool, from `choose` or `OneDegree`; changed in place. `costs`: squared errors. `most`: most
     rows.
     """
     over = int(np.count_nonzero(keep)) - most
@@ -84,19 +84,28 @@ def keep_most(keep: np.ndarray, costs: RemovalCosts, most: int) -> None:
         keep[rows[np.argsort(worth, kind="stable")[:over]]] = False
 
 
-def choose_one_degree(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
-    """As `choose`, but with one SH degree for all rows, for formats in which zero SH take as many bytes as others."""
-    top = len(costs.sh)
-    nothing = np.zeros_like(costs.removal)
-    removal = REMOVAL_FACTOR * costs.removal
-    lagrangian = [
-        (SH_FACTOR * costs.sh[level] if level < top else nothing) + multiplier * bits.of_degree(level)
-        for level in range(top + 1)
-    ]
-    degree = int(np.argmin([np.minimum(removal, whole).sum() for whole in lagrangian]))
-    keep = removal >= lagrangian[degree]
-    keep[costs.weight2 <= 0] = True
-    return keep, np.full(len(keep), degree, np.uint8)
+class OneDegree:
+    """As `choose`, but with one SH degree for all rows, for formats in which zero SH take as many bytes as others.
+
+    The degree never rises in a search: the costs of single rows say too much, and fine-tuning mends most of what SH were worth.
+    """
+
+    def __init__(self) -> None:
+        self._most: int | None = None
+
+    def __call__(self, costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.ndarray, np.ndarray]:
+        """See `choose`."""
+        top = len(costs.sh)
+        nothing = np.zeros_like(costs.removal)
+        removal = REMOVAL_FACTOR * costs.removal
+        lagrangian = [
+            (SH_FACTOR * costs.sh[level] if level < top else nothing) + multiplier * bits.of_degree(level)
+            for level in range((top if self._most is None else min(self._most, top)) + 1)
+        ]
+        self._most = int(np.argmin([np.minimum(removal, whole).sum() for whole in lagrangian]))
+        keep = removal >= lagrangian[self._most]
+        keep[costs.weight2 <= 0] = True
+        return keep, np.full(len(keep), self._most, np.uint8)
 
 
 def drop_bands(

@@ -122,7 +122,7 @@ def open_checkpoint(
     words = f"path {plan.keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {steps > 0}"
     if steps and plan.interleaved:
         # The target says between which rounds a descent comes.
-        words += f" {plan.interleaved!r} {plan.interleave_at!r} {steps} {run.target!r}"
+        words += f" {plan.interleaved!r} {steps} {run.target!r}"
     assert options.near is not None and options.extent is not None
     key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")

@@ -23,9 +23,6 @@ LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
 
-REFITTED = 0.61
-"""Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells:
-docs/results/tuning.md#refitted"""
 LARGEST_STEP = 4
 """Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
 in every view: docs/results/tuning.md#distances"""
@@ -51,9 +48,10 @@ class Effort:
     # `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
     # docs/results/tuning.md#pixels
     pixels: int
-    # `REFITTED` at this effort: the fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
+    # Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells.
+    # The fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
     # makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
-    refitted: float = REFITTED
+    refitted: float
     probed: int = 8  # most poses that trial grids are measured on: docs/results/tuning.md#probed
     # How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0
     # (default): colours are refitted instead.
@@ -61,7 +59,6 @@ class Effort:
     # Most descents between rounds of pruning, before the first candidate, so that pruning knows what mends itself:
     # docs/results/tuning.md#interleaved
     interleaved: int = 0
-    interleave_at: float = 0.8  # pruning stops for such a descent at this share of the loss that the target allows
     # Least Gaussians of a scene that descends; of others, colours are refitted. Small scenes gain nothing by it:
     # docs/results/tuning.md#descends
     descends: int = 0
@@ -123,35 +120,25 @@ def pixels_of(cameras: Sequence[Camera], steps: Sequence[float]) -> int:
     return sum(int(camera.width * camera.height / step**2) for camera, step in zip(cameras, steps, strict=True))
 
 
+_BALANCED = Effort(
+    keep=0.8,
+    refit_rounds=2,
+    subsets=7,
+    close=0.13,
+    few=400,
+    views=400,
+    pixels=24,
+    refitted=0.64,
+    passes=8.0,
+    interleaved=2,
+    descends=10_000,
+)
 EFFORTS = {
     "fast": Effort(
         keep=0.77, refit_rounds=0, subsets=7, close=0.3, few=32, views=96, pixels=12, refitted=0.93, probed=4
     ),
-    "balanced": Effort(
-        keep=0.8,
-        refit_rounds=2,
-        subsets=7,
-        close=0.13,
-        few=400,
-        views=400,
-        pixels=24,
-        refitted=0.64,
-        passes=8.0,
-        interleaved=2,
-        descends=10_000,
-    ),
-    "max": Effort(
-        keep=0.8,
-        refit_rounds=2,
-        subsets=7,
-        close=0.09,
-        few=400,
-        views=400,
-        pixels=24,
-        passes=16.0,
-        interleaved=16,
-        interleave_at=0.6,
-    ),
+    "balanced": _BALANCED,
+    "max": _BALANCED,  # another word: more work gained less than a tenth on most scenes
 }
 
 
@@ -161,14 +148,12 @@ def effort_of(options: CompressOptions) -> Effort:
     return plan if options.distil is None else replace(plan, interleaved=0)
 
 
-def finetune_steps(options: CompressOptions, poses: int, count: int, foreign: bool = False, fine: bool = False) -> int:
+def finetune_steps(options: CompressOptions, poses: int, count: int, fine: bool = False) -> int:
     """Steps of the descent to a candidate; 0 for none.
 
-    `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `foreign`: the file
-    has another format than `.fgs`, with a grid of its own. `fine`: the poses have every pixel: see `is_fine`.
+    `options`: effort, `distil` and `refit`. `poses`: scored poses. `count`: Gaussians of the scene. `fine`: the poses have
+    every pixel: see `is_fine`.
     """
-    if foreign:
-        return 0
     if options.distil is not None:
         return options.distil
     plan = EFFORTS[options.effort]

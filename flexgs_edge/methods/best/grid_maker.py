@@ -18,7 +18,7 @@ from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.grid.values import values_of
 from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
-from flexgs_edge.methods.best.costs import Snapshot, cost_bytes, measure_costs
+from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
@@ -44,6 +44,7 @@ FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
+INTERLEAVE_AT = 0.8  # Pruning stops for a descent at this share of the loss that the target allows
 INTERLEAVE_TO = 0.8
 """The first candidate comes once two descents in a row leave more than this share of the loss that the target allows:
 docs/results/tuning.md#interleaved"""
@@ -53,6 +54,7 @@ many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
+FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 PRICED, ABOVE = -0.035, 0.02
@@ -100,10 +102,15 @@ class Descents:
         return (left + excess) / 2 + behind
 
 
+Choose = Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
+"""Rows to keep ([n] bool) and their SH degrees ([n] u8), from costs, bits and a multiplier."""
+
+
 class GridMaker:
     """Makes grids that are coded in container version 2; a `Maker`.
 
-    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay.
+    `see`: scores poses beside these of the views that decide, as `Maker.see`. `selection`: which Gaussians stay. For files of
+    another format, `size_of` and `decoded` write the file of a grid and read it back.
     """
 
     def __init__(
@@ -115,10 +122,17 @@ class GridMaker:
         refit: bool = True,  # refit the colours of each candidate (default)
         steps: int = 0,  # Views that the descent to a candidate looks at. 0 (default): colours are refitted instead.
         see: Callable[[Sequence[int], int], bool] | None = None,
+        decoded: Callable[[GridScene], Planes] | None = None,  # values of a grid's file; `None`: those of the grid
+        chosen: Choose = choose,
+        bits: BitModel | None = None,
+        fixed_rows: bool = False,  # coarser steps save no bytes
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure
+        self._fixed_rows = fixed_rows
+        self._is_file = decoded is not None
+        self._decoded = decoded or (lambda grid: values_of(grid, rounds.storage))
         self.effort, self.refit, self.steps, self.close = effort, refit, steps, effort.close
-        self.selection = Selection(rounds, effort.keep, choose, BitModel())
+        self.selection = Selection(rounds, effort.keep, chosen, bits or BitModel())
         self._see = see
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
@@ -147,7 +161,7 @@ class GridMaker:
         by_size = target.limit_bytes is not None
         grid = self._finetuned(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
-        if not (self.steps and self.refit) or by_size or candidate.excess <= 0.0:
+        if not (self.steps and self.refit) or by_size or self._is_file or candidate.excess <= 0.0:
             return candidate, grid
         before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
         if before > candidate.excess:
@@ -198,7 +212,7 @@ class GridMaker:
         """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
         by_size, after = target.limit_bytes is not None, -math.inf
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
-            self._guess.prune(self.selection, target, self.effort.interleave_at, fit)
+            self._guess.prune(self.selection, target, INTERLEAVE_AT, fit)
             self.rounds.renew(self._cut_and_descend)
             before = after
             if not by_size:
@@ -241,7 +255,8 @@ class GridMaker:
         if self._slopes is None:
             # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
             self._slopes = self._probe_slopes(snapshot)
-        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), multiplier)
+        worth = FIXED_BITS * multiplier if self._fixed_rows else multiplier
+        step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), worth)
         count = len(kept.rows)
         kept = kept.take(reachable(step_sizes, kept.planes, kept.weight2 > 0), self.rounds.storage)
         kept.left_out = count - len(kept.rows)
@@ -252,7 +267,8 @@ class GridMaker:
 
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
-        moved = self._finetune(kept, self._schedule(1.0, kept.planes, multiplier=multiplier), step_sizes)
+        worth = 0.0 if self._fixed_rows else multiplier
+        moved = self._finetune(kept, self._schedule(1.0, kept.planes, multiplier=worth), step_sizes)
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -293,7 +309,7 @@ class GridMaker:
         size, limit = self.size_of(grid), target.limit_bytes
         if limit is not None and 0.0 < math.log(size / limit) <= REACH:
             grid, size = self._landed(grid, size, limit)
-        measurement = self.measure(values_of(grid, self.rounds.storage))
+        measurement = self.measure(self._decoded(grid))
         excess, seconds = target.excess(size, measurement), time.perf_counter() - started
         return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out), grid
 

@@ -32,7 +32,7 @@ SORTED_ROW_BYTES = 41
 """Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
 ROUND, LARGE_ROUND = 0.8, 0.5
 """Share of the bits that stays before costs are measured again; of more than `MOST_SORTED` rows, the second. Removed Gaussians
-interact, so costs go out of date: docs/results/web.md#layers"""
+interact, so costs go out of date: docs/results/tuning.md#layers"""
 
 
 def can_sort(rows: int, original: int) -> bool:

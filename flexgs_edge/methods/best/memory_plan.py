@@ -68,11 +68,11 @@ USUAL_SHARE = 4
 def expected_bytes(run: Run[CompressOptions]) -> int:
     """Bytes that the search is expected to need at least, with all in scratch files that can lie there; see `foresee`."""
     source, options = run.source, run.options
-    foreign, cameras = run.output.format is not None, run.seen.of(run.seen.train)
+    cameras = run.seen.of(run.seen.train)
     size = size_of(largest_of(cameras))  # poses of large weight keep all their pixels
-    distils = finetune_steps(options, len(cameras), source.count, foreign) > 0
+    distils = finetune_steps(options, len(cameras), source.count) > 0
     held = sum(needed_bytes(DEFAULT, size, source, len(cameras), options, distils))
-    if foreign:
+    if run.output.format is not None:
         return held
     pruning = spilled_bytes(DEFAULT, source, size, shown_rows(run), False)
     few = -(-source.count // DEFAULT.first_share)  # descents begin once many rows went
@@ -93,8 +93,7 @@ class MemoryPlan:
     def of(cls, run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera]) -> MemoryPlan:
         """The plan of a search with these scored poses, where the renderer's storage is."""
         source, options, largest = run.source, run.options, largest_of(scored)
-        foreign, fine = run.output.format is not None, is_fine(options, source)
-        steps = finetune_steps(options, len(scored), source.count, foreign, fine)
+        steps = finetune_steps(options, len(scored), source.count, is_fine(options, source))
         if renderer.storage.spills:
             return cls(steps, SPILLED_ROW_BYTES * source.count, least_spilled(renderer, source, largest, steps > 0))
         view = view_size(renderer.backend, largest)

@@ -36,13 +36,13 @@ from flexgs_edge.views.render_context import RenderContext
 
 LEAST_PREVIEWED, PREVIEW_SHARE = 1_000_000, 0.02
 """Where nothing is said, files from so many bytes on get a preview, of this share of their bytes. A smaller file comes within a
-second over 10 Mbit/s: docs/results/web.md#preview"""
+second over 10 Mbit/s: docs/results/tuning.md#preview"""
 DRAWING = "near", "background", "extent", "antialiased"  # Settings that say how a file is drawn
 STAGES = 8, 4, 2
-"""How many times as many Gaussians each stage leaves as the last one, which comes behind: docs/results/web.md#preview"""
+"""How many times as many Gaussians each stage leaves as the last one, which comes behind: docs/results/tuning.md#preview"""
 STEPS, LAST_STEPS, RATE = 150, 400, 2.0
 """Steps of a descent, and of the last one; factor on the rates, since there is a long way to go."""
-KEPT = 0.5  # Share of the bits that stays in a stage before costs are measured again: docs/results/web.md#preview
+KEPT = 0.5  # Share of the bits that stays in a stage before costs are measured again: docs/results/tuning.md#preview
 COARSE = 2.0  # Step sizes of the preview's grid, as multiples of those of the whole scene's
 POSES, POINTS = 128, 1 << 14  # Most poses, and about the most points that are looked at in each of them
 TRIES, LESS = 3, 0.97

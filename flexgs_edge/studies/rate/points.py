@@ -33,7 +33,6 @@ from flexgs_edge.units import format_size
 
 LOG = logging.getLogger("flexgs_edge")
 
-MAX = "max"  # The effort that distils. It gets a curve of its own.
 WHOLE, UNPRUNED = "whole", "nothing pruned"
 
 

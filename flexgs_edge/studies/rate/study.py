@@ -11,11 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.errors import InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.studies.rate import trade
-from flexgs_edge.studies.rate.points import MAX, Found, best_points, paper_points, peer_points
+from flexgs_edge.studies.rate.points import best_points, paper_points, peer_points
 from flexgs_edge.studies.result_tables import Experiment
 from flexgs_edge.studies.study_scene import StudyScene, open_study_scene, scene_names
 from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
@@ -23,8 +23,6 @@ from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 LOG = logging.getLogger("flexgs_edge")
 
 RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
-DISTILLED = (32.0, 64.0, 128.0)
-"""Ratios of the points at the effort `max`. Below 30 every pixel is looked at, and each point takes longer."""
 
 
 class RateStudy(WrittenStudy):
@@ -39,23 +37,22 @@ def study_rate(
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
     ratios: Sequence[float] = RATIOS,
-    distilled: Sequence[float] = DISTILLED,
     **words: Any,
 ) -> RateStudy:
     """Measure bytes and quality of every method on a scene and write them to a folder.
 
-    `ratios`: PLY bytes over file bytes, for the curves; `distilled`: the same, for the points at the effort `max`.
+    `ratios`: PLY bytes over file bytes.
 
     Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
     written then.
     """
     options = replace(options or CompressOptions(), **{**words, "method": "best"})
-    _check(ratios, distilled)
+    _check(ratios)
 
     def make(folder: Path) -> SceneStudy:
         (name,) = scene_names([scene])
         with open_study_scene(scene, name, options, progress) as studied:
-            return SceneStudy.of(studied, _experiments(studied, folder, sorted(set(ratios)), sorted(set(distilled))))
+            return SceneStudy.of(studied, _experiments(studied, folder, sorted(set(ratios))))
 
     found = write_study(output, options.force, "Bytes and quality", _INTRO, make)
     return RateStudy(os.fspath(output), found)
@@ -68,25 +65,17 @@ _INTRO = (
 )
 
 
-def _check(ratios: Sequence[float], distilled: Sequence[float]) -> None:
-    for word, values in (("--ratios", ratios), ("--distilled", distilled)):
-        bad = [value for value in values if not (math.isfinite(value) and value >= 1.0)]
-        if bad:
-            raise InputError(f"{word} {bad[0]:g}: expected ratios of 1 or more, such as 8,16,32")
+def _check(ratios: Sequence[float]) -> None:
+    bad = [value for value in ratios if not (math.isfinite(value) and value >= 1.0)]
+    if bad:
+        raise InputError(f"--ratios {bad[0]:g}: expected ratios of 1 or more, such as 8,16,32")
     if not ratios:
         raise InputError("--ratios: expected one ratio or more, such as 8,16,32")
 
 
-def _experiments(
-    studied: StudyScene, folder: Path, ratios: Sequence[float], distilled: Sequence[float]
-) -> list[Experiment]:
+def _experiments(studied: StudyScene, folder: Path, ratios: Sequence[float]) -> list[Experiment]:
     effort = studied.run.options.effort
     found = best_points(studied, effort, ratios) + paper_points(studied, ratios)
-    if distilled:
-        try:
-            found += best_points(studied, MAX, distilled)
-        except BudgetError as error:  # a study keeps its scenes in memory
-            found += Found((), (f"best ({MAX}: {error})",))
     with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=folder) as place:
         found += peer_points(studied, Path(place))
     made = [trade.rate(studied, found.points, found.missing, effort)]

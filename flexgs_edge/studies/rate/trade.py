@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from flexgs_edge.report.plots import LineChart, Series
-from flexgs_edge.studies.rate.points import MAX, WHOLE, RatePoint, loss_of, point_columns, point_row
+from flexgs_edge.studies.rate.points import WHOLE, RatePoint, loss_of, point_columns, point_row
 from flexgs_edge.studies.result_tables import Cell, Experiment, Table, mean
 from flexgs_edge.studies.study_scene import FIGURES, StudyScene
 
@@ -63,7 +63,7 @@ def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str
     return Experiment(
         "rate",
         "Bytes and quality",
-        f"Every method at the sizes asked for: best at the effort {effort} and distilled (the effort {MAX}), paper with "
+        f"Every method at the sizes asked for: best at the effort {effort}, paper with "
         "its rates to choose, and the whole scene in the formats of other programs as this one writes them. "
         f"{against}; {FIDELITY_WORDS}. "
         "The first seconds of a curve include most of the rounds of pruning, which its other points share.",
@@ -90,18 +90,14 @@ def fidelity(studied: StudyScene, points: Sequence[RatePoint], effort: str) -> E
         _chart(table, "Bytes and fidelity", "fidelity", effort),
         (
             "Fidelity of best: "
-            + ", ".join(
-                f"{row['fidelity']:.1f} dB at {row['ratio']:.0f}x{' distilled' if row['effort'] == MAX else ''}"
-                for row in rows
-                if row["method"] == "best"
-            )
+            + ", ".join(f"{row['fidelity']:.1f} dB at {row['ratio']:.0f}x" for row in rows if row["method"] == "best")
             + ".",
         ),
     )
 
 
 def _on_curve(method: str, variant: str, effort: str | None, wanted: str) -> bool:
-    return method != "best" or (variant == WHOLE and effort in (wanted, MAX))
+    return method != "best" or (variant == WHOLE and effort == wanted)
 
 
 def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
@@ -109,7 +105,7 @@ def _chart(table: Table, title: str, figure: str, effort: str) -> LineChart:
     for row in table.rows:
         method = str(row["method"])
         if _on_curve(method, str(row["variant"]), None if row["effort"] is None else str(row["effort"]), effort):
-            series.setdefault(f"{method}, distilled" if row["effort"] == MAX else method, []).append(dict(row))
+            series.setdefault(method, []).append(dict(row))
     floating = figure == "fidelity"
     return LineChart(
         title,

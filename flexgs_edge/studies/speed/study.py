@@ -20,7 +20,7 @@ from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 
 LOG = logging.getLogger("flexgs_edge")
 
-PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"), ("best", "max"))
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))
 """Method and effort of each run."""
 
 

@@ -13,8 +13,8 @@ from flexgs_edge.methods.best.allocation import (
     REMOVAL_FACTOR,
     SH_FACTOR,
     BitModel,
+    OneDegree,
     choose,
-    choose_one_degree,
     drop_bands,
     keep_most,
     keep_one,
@@ -169,7 +169,7 @@ def test_one_degree_for_all_is_the_cheapest_of_its_kind(seed: int, multiplier: f
     rng = np.random.default_rng(seed)
     sh = np.sort(rng.uniform(0, 100, (3, 12)), axis=0)[::-1]
     costs = costs_of(rng.uniform(0, 200, 12).tolist(), sh.tolist())
-    keep, degrees = choose_one_degree(costs, BITS, multiplier)
+    keep, degrees = OneDegree()(costs, BITS, multiplier)
     assert len(set(degrees.tolist())) == 1
 
     def total(kept: np.ndarray, degree: int) -> float:
@@ -183,9 +183,21 @@ def test_one_degree_for_all_is_the_cheapest_of_its_kind(seed: int, multiplier: f
         assert found <= min(total(np.ones(12, bool), degree), alone.min()) * (1 + 1e-9)
 
 
+def test_one_degree_never_rises() -> None:
+    costs = costs_of([50.0] * 3, [[9.0] * 3, [4.0] * 3, [1.0] * 3])
+    chosen = OneDegree()
+    fine, coarse = 1e-3, 3.0
+    assert chosen(costs, BITS, fine)[1].tolist() == [3, 3, 3] and chosen(costs, BITS, coarse)[1].tolist() == [0, 0, 0]
+    assert chosen(costs, BITS, fine)[1].tolist() == [0, 0, 0] and OneDegree()(costs, BITS, fine)[1].tolist() == [
+        3,
+        3,
+        3,
+    ]
+
+
 def test_one_degree_keeps_what_nobody_sees() -> None:
     costs = costs_of([0.0, 1e9, 0.0], [[0, 1e6, 0]] * 3, weight2=[0.0, 1.0, 1.0])
-    keep, degrees = choose_one_degree(costs, BITS, 1.0)
+    keep, degrees = OneDegree()(costs, BITS, 1.0)
     assert keep.tolist() == [True, True, False] and degrees.tolist() == [3, 3, 3]
 
 

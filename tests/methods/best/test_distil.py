@@ -270,7 +270,6 @@ def test_distilled_files_lose_less_in_the_same_bytes(sample_dir: Path, tmp_path:
         ({"distil": 10, "method": "paper"}, "--distil belongs to --method best"),
         ({"distil": -1}, "--distil -1: expected 0"),
         ({"distil": 10, "refit": False}, "--no-refit with --distil 10"),
-        ({"effort": "max", "refit": False}, "--no-refit with --effort max"),
     ],
 )
 def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:

@@ -26,10 +26,8 @@ from synthetic import make_camera
 def test_efforts_grow() -> None:
     fast, balanced, most = EFFORTS.values()
     for name in ("keep", "refit_rounds", "views", "passes"):
-        assert getattr(fast, name) <= getattr(balanced, name) <= getattr(most, name)
-        assert getattr(fast, name) < getattr(most, name)
-    assert fast.close > balanced.close > most.close
-    assert fast.passes == 0 < balanced.passes < most.passes
+        assert getattr(fast, name) < getattr(balanced, name)
+    assert fast.close > balanced.close and most is balanced
 
 
 def test_who_descends() -> None:
@@ -39,11 +37,10 @@ def test_who_descends() -> None:
     assert finetune_steps(CompressOptions(), 2, least) == LEAST_STEPS
     assert finetune_steps(CompressOptions(), 4 * MANY_POSES, least) == round(2 * MANY_POSES * passes)
     assert finetune_steps(CompressOptions(), 100, least - 1) == 0 < finetune_steps(CompressOptions(), 100, least)
-    assert finetune_steps(CompressOptions(effort="max"), 100, least - 1) > 0
     assert finetune_steps(CompressOptions(distil=7), 100, least - 1) == 7
     assert effort_of(CompressOptions()).interleaved > 0 == effort_of(CompressOptions(distil=7)).interleaved
-    for words, foreign in (({"distil": 0}, False), ({"refit": False}, False), ({"effort": "fast"}, False), ({}, True)):
-        assert finetune_steps(CompressOptions(**words), 100, least, foreign) == 0, (words, foreign)
+    for words in ({"distil": 0}, {"refit": False}, {"effort": "fast"}):
+        assert finetune_steps(CompressOptions(**words), 100, least) == 0, words
 
 
 @pytest.mark.parametrize(

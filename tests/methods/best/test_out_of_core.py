@@ -96,7 +96,8 @@ def test_a_run_goes_on_from_its_last_round(
     assert rounds >= 2
     # Other poses, a descent to follow, which wants views from between them, or descents between the rounds, whose place depends
     # on the target: not what was kept.
-    most = {"effort": "max", "layers": 1}
+    monkeypatch.setitem(EFFORTS, "balanced", replace(EFFORTS["balanced"], descends=0))
+    most = {"effort": "balanced", "layers": 1}
     changes = ({"holdout": 3}, {"distil": 10, "layers": 1}, most, {**most, "min_fidelity": 36.0})
     for folders, change in enumerate(changes, start=2):
         stop_after(0)
@@ -117,9 +118,9 @@ def test_descents_between_the_rounds_are_not_done_again(
 ) -> None:
     steps = 100
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
-    monkeypatch.setitem(EFFORTS, "max", replace(EFFORTS["max"], interleaved=3))
+    monkeypatch.setitem(EFFORTS, "balanced", replace(EFFORTS["balanced"], interleaved=3, descends=0))
     monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVE_TO", 99.0)
-    words: dict[str, Any] = {**TINY, "effort": "max"}
+    words: dict[str, Any] = {**TINY, "effort": "balanced"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}
     moved: list[int] = []

@@ -15,13 +15,11 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.io.exchange import read_foreign, write_foreign
-from flexgs_edge.io.formats import FORMATS, WRITTEN
+from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.frames import RDF
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.methods.foreign.file_maker import read_geometry
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
@@ -90,11 +88,6 @@ def test_finished_files_fit(project: Path, tmp_path: Path, suffix: str) -> None:
     limit = 6000 if suffix == ".spz" else 7500
     result = compress(project / "point_cloud.ply", path, max_size=limit, **FAST)
     assert result.reached and 0.7 * limit < path.stat().st_size <= limit and result.size == path.stat().st_size
-
-
-def test_max_refits_more_where_nothing_descends(project: Path, tmp_path: Path) -> None:
-    found = compress(project / "point_cloud.ply", tmp_path / "a.spz", max_drop=2.0, **{**FAST, "effort": "max"})
-    assert found.search is not None and found.search.reached and found.size == (tmp_path / "a.spz").stat().st_size
 
 
 def test_out_of_reach(project: Path, tmp_path: Path) -> None:
@@ -184,22 +177,6 @@ def test_on_the_command_line(
     with pytest.raises(SystemExit) as caught:
         app.main(["info", str(tmp_path / "a.compressed.ply")])
     assert caught.value.code == 0 and f"{COUNT}, SH degree 2" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("suffix", WRITTEN)
-def test_geometry_comes_back_row_by_row(tmp_path: Path, suffix: str) -> None:
-    source = random_scene(1500, seed=5, degree=2)
-    found, rows = read_geometry(tmp_path, source, FORMATS[suffix])
-    assert sorted(rows.tolist()) == list(range(1500)) and list(tmp_path.iterdir()) == []
-    planes = source.read(slice(0, 1500), list(FIELD))
-    means = found.read(slice(0, 1500), ["means"])["means"] + (found.origin - source.origin)[:, None]
-    assert np.abs(means - planes["means"][:, rows]).max() < 0.02
-    # The whole scene comes back with the same geometry.
-    write_foreign(tmp_path / f"a{suffix}", source)
-    whole = read_foreign(tmp_path / f"a{suffix}")
-    for name in ("means", "log_scales", "quats", "opacity_logits"):
-        one, two = (s.read(slice(0, 1500), [name])[name] for s in (found, whole))
-        np.testing.assert_array_equal(one, two, err_msg=name)
 
 
 def test_gsply_sees_what_we_see(done: tuple[Path, CompressResult]) -> None:
