@@ -13,6 +13,9 @@ GAIN_DIGITS = 4  # Decimals in comparisons of what a camera adds, as a share of 
 SAME_VIEW = 0.2
 """Two views of a point overlap if the cosine between their directions differs from 1 by less than this: up to 37
 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
+DIGITS = 8  # Decimals in comparisons of squared distances, so that rounding does not break ties
+BESIDE_EACH_OTHER = 2.0
+"""Squared distance of two directions at a right angle. A camera that is farther turned looks the other way."""
 
 
 def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, count: int) -> list[int]:
@@ -48,11 +51,6 @@ def in_picture(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside: np.ndarray = (z > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     return inside
-
-
-DIGITS = 8  # Decimals in comparisons of squared distances, so that rounding does not break ties
-BESIDE_EACH_OTHER = 2.0
-"""Squared distance of two directions at a right angle. A camera that is farther turned looks the other way."""
 
 
 def squared_distances(cameras: Sequence[Camera], others: Sequence[Camera]) -> np.ndarray:

@@ -17,6 +17,14 @@ from flexgs_edge.cameras.transforms import cameras_of_frames
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.small_matrices import product
 
+NERF_SYNTHETIC = "transforms_train.json"
+JSON_NAMES = ("cameras.json", "transforms.json", NERF_SYNTHETIC)
+SUPPORTED = (
+    "INRIA's cameras.json (any .json file with a list of cameras), NeRF's or nerfstudio's transforms.json, "
+    "a list of poses of ns-export cameras, "
+    "a COLMAP model (cameras and images, .bin or .txt), or a folder that holds one of them"
+)
+
 
 def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
     """Read INRIA's cameras.json in the file's order.
@@ -72,15 +80,6 @@ def _camera(entry: Entry) -> Camera:
     return Camera(
         name, width, height, rotation, product(-rotation, position), fx, fy, (width - 1) / 2, (height - 1) / 2
     )
-
-
-NERF_SYNTHETIC = "transforms_train.json"
-JSON_NAMES = ("cameras.json", "transforms.json", NERF_SYNTHETIC)
-SUPPORTED = (
-    "INRIA's cameras.json (any .json file with a list of cameras), NeRF's or nerfstudio's transforms.json, "
-    "a list of poses of ns-export cameras, "
-    "a COLMAP model (cameras and images, .bin or .txt), or a folder that holds one of them"
-)
 
 
 def find_cameras(folder: str | os.PathLike[str]) -> Path | None:

@@ -94,7 +94,6 @@ Several scenes:
     "--promise",
     type=click.Choice(["whole", "mean"]),
     default="whole",
-    show_default=True,
     help="whole: also bound the worst view, SSIM and made poses. mean: the target alone, by the mean of the views.",
 )
 @option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
@@ -126,7 +125,6 @@ Several scenes:
     metavar="WORD",
     type=click.Choice(["fast", "balanced", "max"]),
     default="balanced",
-    show_default=True,
     help="fast or balanced: smaller files, slower. max is another word for balanced.",
 )
 @option(
@@ -175,7 +173,6 @@ Several scenes:
     "--method",
     type=click.Choice(["best", "paper"]),
     default="best",
-    show_default=True,
     help="best: the smallest files. paper: the FlexGaussian paper's method; faster, much larger files.",
 )
 @option(
@@ -183,7 +180,6 @@ Several scenes:
     "--unseen",
     metavar="keep|drop|N%",
     default="keep",
-    show_default=True,
     help="What to do with Gaussians that no training view sees. keep: without view-dependent colour. drop: leave them out. "
     "N%: only the largest and most opaque N %.",
 )
@@ -208,7 +204,6 @@ Several scenes:
     "--score",
     type=click.Choice(["gs", "meson"]),
     default="gs",
-    show_default=True,
     help="Importance of a Gaussian. gs: opacity, volume and pixels hit. meson: as MesonGS.",
 )
 @option(
@@ -236,7 +231,6 @@ Several scenes:
     "--bits",
     metavar="SPEC",
     default="paper",
-    show_default=True,
     help="Bits of each value. paper: xyz=16,dc=8,scale=8,rot=8,opacity=4,rest=4. A list such as rest=3,dc=7: the others as in "
     "paper. auto: searched. rtn8, rtn4, ...: as many for all values (a weak baseline).",
 )

@@ -42,7 +42,8 @@ class SectionOption(click.Option):
 
 
 def option(section: str, *names: str, **kwargs: Any) -> Callable[[Decorated], Decorated]:
-    """Make a `click.option` that appears under a heading."""
+    """Make a `click.option` that appears under a heading. Its default is shown, unless it is a flag or has none."""
+    kwargs.setdefault("show_default", not isinstance(kwargs.get("default"), (bool, type(None))))
     return click.option(*names, cls=SectionOption, section=section, **kwargs)
 
 

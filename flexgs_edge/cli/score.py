@@ -17,7 +17,6 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--score",
     type=click.Choice(["gs", "meson"]),
     default="gs",
-    show_default=True,
     help="gs: opacity * volume^0.1 * pixels hit. meson: volume^0.1 * summed weights.",
 )
 @shared_options.photos_options

@@ -34,13 +34,7 @@ reading_options = stack(
     ),
 )  # Options of every command that reads a scene with its values
 spz_version_option = option(
-    OUTPUT,
-    "--spz-version",
-    metavar="3|4",
-    type=int,
-    default=3,
-    show_default=True,
-    help="Version of a .spz. Older programs read only 3.",
+    OUTPUT, "--spz-version", metavar="3|4", type=int, default=3, help="Version of a .spz. Older programs read only 3."
 )
 positions_options = stack(
     option(
@@ -97,7 +91,6 @@ exposure_option = option(
     "--exposure",
     type=click.Choice(["fit", "none"]),
     default="fit",
-    show_default=True,
     help="fit: bring photos of another exposure or white balance than the scene's to the scene's before they are compared. "
     "none: compare them as they are.",
 )
@@ -107,7 +100,6 @@ holdout_option = option(
     metavar="N",
     type=int,
     default=DEFAULT_HOLDOUT,
-    show_default=True,
     help="Hold out every N-th view by name, from the first. Held-out views measure quality, the others are training views. "
     "0: hold out none.",
 )
@@ -116,7 +108,6 @@ select_option = option(
     "--select",
     type=click.Choice(["test", "train"]),
     default="test",
-    show_default=True,
     help="Views that decide if the target is met: held-out ones (test) or training views (train). Training views are not "
     "compared with photos.",
 )
@@ -127,7 +118,6 @@ drawing_options = stack(
         metavar="PIXELS",
         type=int,
         default=MAX_VIEW_WIDTH,
-        show_default=True,
         help="Largest width of a view. Wider views are scaled down. Smaller is faster and less exact.",
     ),
     option(
@@ -164,7 +154,6 @@ base_psnr_option = option(
     metavar="DB",
     type=float,
     default=DEFAULT_BASE_PSNR,
-    show_default=True,
     help="The modelled drop (the estimate without photos) assumes this PSNR of the original against its photos. "
     "Higher is more cautious.",
 )
@@ -218,3 +207,6 @@ study_options = stack(
 results_option = option(
     OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the results; made if missing."
 )  # Options for the output of a study
+study_target_option = option(
+    "Target", "--max-drop", metavar="DB", type=float, default=1.0, help="Loss of PSNR that compressed results aim at."
+)

@@ -29,7 +29,6 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--host",
     metavar="ADDRESS",
     default="127.0.0.1",
-    show_default=True,
     help="Address of the server. Others than the default let other machines see the scene.",
 )
 @shared_options.cameras_option

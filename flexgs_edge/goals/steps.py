@@ -9,6 +9,9 @@ from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.goals.promise import Promised, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
+MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
+REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 10}  # Measured points of the refinement for each `--effort`
+
 
 @dataclass(frozen=True, order=True)
 class Choice:
@@ -47,8 +50,6 @@ class Choice:
 
 
 Phase = Literal["list", "refine", "confirm", "fixed", "multiplier"]
-MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
-REFINE_STEPS = {"fast": 4, "balanced": 10, "max": 10}  # Measured points of the refinement for each `--effort`
 
 
 @dataclass(frozen=True)

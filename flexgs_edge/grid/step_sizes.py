@@ -16,6 +16,9 @@ from flexgs_edge.scene.contraction import OCTAVES, Contraction, densest
 POSITION_BITS = 21  # A scene is at most 2^21 cells wide on each axis; three coordinates fill a Morton index of 63 bits
 
 Planes = Mapping[str, np.ndarray]
+_HALF = 2 ** (POSITION_BITS - 1) - 2  # Steps from the centre of a grid to its ends
+_LEAST_RADIUS = _HALF.bit_length() - OCTAVES.bit_length()
+"""Binary logarithm of the smallest radius, in steps: all octaves then fit."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,6 @@ class StepSizes:
         """[3] f32, the steps of Y, Co and Cg, given the step of luma."""
         chroma = np.float32(luma) * np.float32(self.chroma)
         return np.array([luma, chroma, chroma], np.float32)
-
-
-_HALF = 2 ** (POSITION_BITS - 1) - 2  # Steps from the centre of a grid to its ends
-_LEAST_RADIUS = _HALF.bit_length() - OCTAVES.bit_length()
-"""Binary logarithm of the smallest radius, in steps: all octaves then fit."""
 
 
 def position_grid(means: np.ndarray, step: float) -> tuple[float, Contraction | None]:

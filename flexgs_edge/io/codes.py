@@ -6,6 +6,20 @@ from itertools import product
 
 import numpy as np
 
+SMALLER = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""The components of a quaternion that are stored, by the largest one."""
+_HALF = float(np.sqrt(0.5))
+_FORMS: tuple[tuple[tuple[float, float, float, float], tuple[int, int, int]], ...] = (
+    ((1.0, 0.0, 0.0, 0.0), (0, 1, 2)),
+    ((_HALF, _HALF, 0.0, 0.0), (0, 2, 1)),
+    ((_HALF, 0.0, _HALF, 0.0), (2, 1, 0)),
+    ((_HALF, 0.0, 0.0, _HALF), (1, 0, 2)),
+    ((0.5, 0.5, 0.5, 0.5), (1, 2, 0)),
+    ((0.5, -0.5, -0.5, -0.5), (2, 0, 1)),
+)
+"""Turns of the axes, w x y z, and the old axis behind each new one. The other 18 forms swap and negate components only."""
+_ROUND = 1e-4  # What turns of round Gaussians count, so that these round to the nearest
+
 
 def nearest(values: np.ndarray, most: int = 255) -> np.ndarray:
     """The nearest integers from 0 to `most`: u8, or u32 where these do not suffice.
@@ -55,21 +69,6 @@ def _places(largest: np.ndarray) -> np.ndarray:
     places = np.arange(3)[:, None]
     moved: np.ndarray = places + (places >= largest)
     return moved
-
-
-SMALLER = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-"""The components of a quaternion that are stored, by the largest one."""
-_HALF = float(np.sqrt(0.5))
-_FORMS: tuple[tuple[tuple[float, float, float, float], tuple[int, int, int]], ...] = (
-    ((1.0, 0.0, 0.0, 0.0), (0, 1, 2)),
-    ((_HALF, _HALF, 0.0, 0.0), (0, 2, 1)),
-    ((_HALF, 0.0, _HALF, 0.0), (2, 1, 0)),
-    ((_HALF, 0.0, 0.0, _HALF), (1, 0, 2)),
-    ((0.5, 0.5, 0.5, 0.5), (1, 2, 0)),
-    ((0.5, -0.5, -0.5, -0.5), (2, 0, 1)),
-)
-"""Turns of the axes, w x y z, and the old axis behind each new one. The other 18 forms swap and negate components only."""
-_ROUND = 1e-4  # What turns of round Gaussians count, so that these round to the nearest
 
 
 def unpack_small(codes: np.ndarray, mode: np.ndarray) -> np.ndarray:

@@ -12,6 +12,18 @@ import numpy as np
 
 _BINS = 1024
 _ROUNDS = 10
+_LARGEST = 511  # Largest whole number: 45 squares of it, and any part of their sum, stay below 2^24
+_CLIP = 16.0  # Coefficients beyond this many root mean squares are clipped while vectors are compared
+_FINE = 4096  # Parts of a whole number that means keep
+_GROUP = 256
+_CANDIDATES = 1536
+"""Vectors are divided into groups of about the first number. Each is compared with those of the nearest groups, about the
+second number."""
+_SHARE = 0.15
+"""Largest part of the clusters that is merged at a time. Smaller parts give better palettes, and take longer."""
+_SAMPLE = 4  # Vectors that clusters are merged from, for each entry of the palette
+_PASSES = 4  # Passes in which vectors choose the best entry near theirs, and entries move to the mean of their vectors
+_BLOCK = 1 << 21  # Products held at a time
 
 
 def best_codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> np.ndarray:
@@ -127,20 +139,6 @@ def _one_more(sums: _Sums, edges: np.ndarray, losses: np.ndarray, count: int) ->
             right = np.where(between + step < bins, choice[np.minimum(between + step, bins - 1)], bins - 1)
             low[between], high[between] = left, right
     return best, choice
-
-
-_LARGEST = 511  # Largest whole number: 45 squares of it, and any part of their sum, stay below 2^24
-_CLIP = 16.0  # Coefficients beyond this many root mean squares are clipped while vectors are compared
-_FINE = 4096  # Parts of a whole number that means keep
-_GROUP = 256
-_CANDIDATES = 1536
-"""Vectors are divided into groups of about the first number. Each is compared with those of the nearest groups, about the
-second number."""
-_SHARE = 0.15
-"""Largest part of the clusters that is merged at a time. Smaller parts give better palettes, and take longer."""
-_SAMPLE = 4  # Vectors that clusters are merged from, for each entry of the palette
-_PASSES = 4  # Passes in which vectors choose the best entry near theirs, and entries move to the mean of their vectors
-_BLOCK = 1 << 21  # Products held at a time
 
 
 def sh_palette(values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,10 @@ STEPS_A_PAIR = 24
 """Steps that a pair of splat and tile may take. A blend of the GPU form takes 17 where the compiler leaves its sums a loop;
 `tile_count` takes 7.25: the splat, its row of tiles (1.25), the four block rows of that, the tile."""
 _DIGITS = 2048
+SCAN_GROUPS = (1024, 256, 64)  # Sizes of the work-group that scans on GPUs: the largest that the device allows
+LIST_GROUP = 64  # Size of the work-groups that list pairs on GPUs
+GPU_BLOCKS = (64, 256)
+"""Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 
 
 def steps_of(name: str, size: tuple[int, ...], args: tuple[Any, ...]) -> int:
@@ -48,12 +52,6 @@ def check_steps(info: DeviceInfo, name: str, size: tuple[int, ...], args: tuple[
             f"{info.name} ({info.platform}) leaves loops after {info.loop_steps} steps, and {name} needs {steps}: "
             f"use another device, or {what}"
         )
-
-
-SCAN_GROUPS = (1024, 256, 64)  # Sizes of the work-group that scans on GPUs: the largest that the device allows
-LIST_GROUP = 64  # Size of the work-groups that list pairs on GPUs
-GPU_BLOCKS = (64, 256)
-"""Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
 
 
 class OpenCLBackend(Session):

@@ -20,6 +20,13 @@ from flexgs_edge.memory.budget import MemoryBudget
 _CONTEXTS: dict[int, cl.Context] = {}  # By device
 _PROGRAMS: dict[tuple[int, str, tuple[str, ...]], tuple[cl.Context, cl.Program]] = {}
 """By context, source and options. Each keeps its context, so that no other one takes its number."""
+SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
+FILLED_TOGETHER = (16, 8, 4, 2)
+"""Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
+SMALL_WRITE = 1 << 16  # Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write
+HELD_WRITE = 1 << 22
+"""Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them:
+docs/results/tuning.md#one_pass"""
 
 
 def context_of(device: cl.Device) -> cl.Context:
@@ -42,16 +49,6 @@ def built_program(context: cl.Context, source: str, options: tuple[str, ...]) ->
             built = cl.Program(context, source).build(options=["-cl-std=CL1.2", *options], cache_dir=False)  # type: ignore[arg-type]
         _PROGRAMS[key], seconds = (context, built), time.perf_counter() - start
     return _PROGRAMS[key][1], seconds
-
-
-SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
-
-FILLED_TOGETHER = (16, 8, 4, 2)
-"""Elements of a pattern that fills an array, where its size allows. Patterns have at most 128 bytes."""
-SMALL_WRITE = 1 << 16  # Most bytes of a write that does not wait for the queue: docs/results/tuning.md#small_write
-HELD_WRITE = 1 << 22
-"""Most bytes of values that stay, which a write holds on to without waiting. The budget does not count them:
-docs/results/tuning.md#one_pass"""
 
 
 class DeviceArray:

@@ -11,6 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 
 SAMPLE_SECONDS = 0.05  # Seconds between two samples of the memory; shorter peaks may be missed
+MAP_THRESHOLD, TRIM_THRESHOLD, ARENA_MAX = -3, -1, -8
+"""Parameters of glibc's `mallopt`: bytes from which arrays are mapped, free bytes that a heap keeps, heaps for threads."""
+USUAL = {MAP_THRESHOLD: 8 << 20, TRIM_THRESHOLD: 32 << 20, ARENA_MAX: 2}
+STRICT = {MAP_THRESHOLD: 1 << 20, TRIM_THRESHOLD: 2 << 20, ARENA_MAX: 2}
+NEAR = 0.9  # Share of the limit from which freed memory goes back at once: docs/results/tuning.md#heap
+GROWTH = 8 << 20  # Bytes by which the process must have grown since the last trim of its heaps to be worth another one
 
 
 def peak_rss() -> int:
@@ -102,14 +108,6 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
                 stat = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
                 # Inactive file pages count as used, but the kernel drops them first.
                 yield limit - int((place / used).read_text()) + int(stat.get(cache, 0))
-
-
-MAP_THRESHOLD, TRIM_THRESHOLD, ARENA_MAX = -3, -1, -8
-"""Parameters of glibc's `mallopt`: bytes from which arrays are mapped, free bytes that a heap keeps, heaps for threads."""
-USUAL = {MAP_THRESHOLD: 8 << 20, TRIM_THRESHOLD: 32 << 20, ARENA_MAX: 2}
-STRICT = {MAP_THRESHOLD: 1 << 20, TRIM_THRESHOLD: 2 << 20, ARENA_MAX: 2}
-NEAR = 0.9  # Share of the limit from which freed memory goes back at once: docs/results/tuning.md#heap
-GROWTH = 8 << 20  # Bytes by which the process must have grown since the last trim of its heaps to be worth another one
 
 
 def return_freed_memory(settings: dict[int, int] = USUAL) -> None:

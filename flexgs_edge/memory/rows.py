@@ -18,6 +18,16 @@ BUFFER_BYTES = 1 << 21
 """Bytes of the buffer of each thread that reads past the cache: one huge page. Disks fill scattered small pages more
 slowly: docs/results/tuning.md#disks"""
 _HELD = threading.local()
+BLOCK_ROWS = 1 << 14  # Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes
+AHEAD_ROWS = 1 << 15  # Rows that are read ahead at a time
+COPY_ROWS = 1 << 18  # Rows of one plane that are copied at a time: a megabyte of f32
+DENSE = 4  # Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page
+READERS = 4  # Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks
+_READING = ThreadPoolExecutor(READERS, "read")
+_TAKING = ThreadPoolExecutor(2, "take")
+"""Threads that take listed rows: while one plane is read or written, another is indexed."""
+READING_BYTES = (READERS + 4) * BUFFER_BYTES
+"""Bytes of the buffers of the reading threads, and of the threads that take rows, load chunks or read ahead."""
 
 
 class DirectFile:
@@ -91,16 +101,6 @@ def _library() -> ctypes.CDLL | None:
     return None
 
 
-BLOCK_ROWS = 1 << 14  # Rows of a part in loops over rows: 24 MB of all fields in f64, with the copies that NumPy makes
-AHEAD_ROWS = 1 << 15  # Rows that are read ahead at a time
-COPY_ROWS = 1 << 18  # Rows of one plane that are copied at a time: a megabyte of f32
-DENSE = 4  # Listed rows are read as one span if it holds at most so many rows for each listed one, else page by page
-READERS = 4  # Threads that read past the cache. One thread does not keep a disk busy: docs/results/tuning.md#disks
-_READING = ThreadPoolExecutor(READERS, "read")
-_TAKING = ThreadPoolExecutor(2, "take")
-"""Threads that take listed rows: while one plane is read or written, another is indexed."""
-READING_BYTES = (READERS + 4) * BUFFER_BYTES
-"""Bytes of the buffers of the reading threads, and of the threads that take rows, load chunks or read ahead."""
 _Piece = tuple[DirectFile, int, memoryview]
 """A part to read: its file, its first byte in the file, and the memory to fill."""
 

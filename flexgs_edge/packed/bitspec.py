@@ -10,6 +10,9 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.packed.bitpack import MAX_BITS
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
+HIGH, LOW, POSITION = 8, 4, 16
+ALLOWED_DROP = 0.3  # Modelled drop in dB that all attributes at 4 bits may cost together
+
 
 @dataclass(frozen=True)
 class BitSpec:
@@ -59,10 +62,6 @@ class BitSpec:
 
 
 PAPER = BitSpec()  # 16 bits for positions, 8 for DC, scale and rotation, 4 for opacity and SH
-
-
-HIGH, LOW, POSITION = 8, 4, 16
-ALLOWED_DROP = 0.3  # Modelled drop in dB that all attributes at 4 bits may cost together
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,11 @@ _BANDS = ThreadPoolExecutor(BANDS, "bands")
 MSE_FLOOR = 1e-12
 """Smallest MSE in a difference of two PSNRs; smaller ones (120 dB) are beyond the precision of float32 renders."""
 BLIND_DROP = 1.0  # A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`
+DARK, BRIGHT = 2 / 255, 253 / 255  # Values outside these may be clipped, and tell no gain
+FIT_PIXELS = 1 << 16
+"""Every n-th pixel in both directions is fitted, so that at least this many are, or all of a smaller picture."""
+LEAST_GAIN = 0.5
+"""A fit counts if it lowers the error by this much, dB. Without a smaller one, a drop of 1 dB reads as .9 dB or more."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -147,13 +152,6 @@ def far_bases(
 
 def _shape(image: np.ndarray) -> str:
     return "x".join(str(side) for side in image.shape[1::-1])
-
-
-DARK, BRIGHT = 2 / 255, 253 / 255  # Values outside these may be clipped, and tell no gain
-FIT_PIXELS = 1 << 16
-"""Every n-th pixel in both directions is fitted, so that at least this many are, or all of a smaller picture."""
-LEAST_GAIN = 0.5
-"""A fit counts if it lowers the error by this much, dB. Without a smaller one, a drop of 1 dB reads as .9 dB or more."""
 
 
 def exposure_gains(image: np.ndarray, photo: np.ndarray) -> np.ndarray | None:

@@ -27,6 +27,9 @@ from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
 from flexgs_edge.render.view_buffers import ViewBuffers
 from flexgs_edge.small_matrices import product
 
+AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
+"""Bytes that one waiting splat takes in the scratch file, its row number included."""
+
 
 def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray:
     """Compute the 32 floats that `project` reads, in float64, and round them once.
@@ -122,10 +125,6 @@ def fill_compact(
             if not view.put((records.take(shown, axis=0), keys.take(shown), bounds.take(shown), rows)):
                 return chunk.base + chunk.count
     return scene.count
-
-
-AHEAD_ROW_BYTES = shapes_bytes(chunk_shapes(1)) + 4
-"""Bytes that one waiting splat takes in the scratch file, its row number included."""
 
 
 class WaitingView:

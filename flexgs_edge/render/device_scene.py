@@ -129,7 +129,7 @@ class DeviceScene:
 
         It covers the chunks on the backend. With `of_source`, or if the scene is streamed, it covers the stored values.
 
-        Returns none if nothing is on the backend and there is no source.
+        Returns `None` if nothing is on the backend and there is no source.
         """
         source = self.source
         if source is not None and (of_source or self._streamed):

@@ -18,28 +18,20 @@ if TYPE_CHECKING:
 class ConversionLoss:
     """What a file in another program's format lost of its scene.
 
-    Parameters
-    ----------
-    values : dict of str to tuple of float
-        Median and largest errors of positions (scene units, and over the splat's size), log-scales, opacities and colours.
-    views : int
-        Views that were compared, drawn by `cameras`.
-    fidelity, worst : float or None
-        PSNR of the file's pictures against the scene's, dB: mean and worst view; `None` if identical or not drawn.
-    drop : float or None
-        Modelled drop from `base_psnr`, dB.
-    why : str
-        Why no pictures were compared.
+    `fidelity`, `worst`: PSNR of the file's pictures against the scene's, dB: mean and worst view; `None` if identical
+    or not drawn.
     """
 
+    # Median and largest errors of positions (scene units, and over the splat's size), log-scales, opacities and
+    # colours.
     values: dict[str, tuple[float, float]]
-    views: int = 0
+    views: int = 0  # views that were compared, drawn by `cameras`
     cameras: str = ""
     fidelity: float | None = None
     worst: float | None = None
-    drop: float | None = None
+    drop: float | None = None  # modelled drop from `base_psnr`, dB
     base_psnr: float | None = None
-    why: str = ""
+    why: str = ""  # why no pictures were compared
 
     def lines(self) -> list[str]:
         """Lines of the summary."""

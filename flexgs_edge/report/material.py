@@ -9,6 +9,15 @@ import numpy as np
 
 from flexgs_edge.goals.target import Target
 
+ERROR_SCALE = 0.1
+"""Differences from this share of the full range up get the brightest colour. All maps use the same scale, so that two pages can
+be compared. At a fidelity of 40 dB a typical difference is a tenth of it, and half of it at edges."""
+FLIP_SCALE = 0.5
+"""FLIP from this value up gets the brightest colour. At a drop of 1 dB a typical pixel has a tenth to a fifth of it, and one in a
+hundred 0.15 to 0.3."""
+# Brightness rises evenly, so that the map can also be read in grey.
+_STOPS = ((8, 6, 20), (74, 24, 110), (176, 50, 92), (240, 120, 40), (255, 206, 90), (255, 252, 232))
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -76,16 +85,6 @@ class Material:
     contents: dict[str, Any] | None = None  # JSON record of `info`; `None` for formats whose channels it does not know
     target: Target | None = None  # target that the search chart marks with a line
     live: Live | None = None  # live scenes
-
-
-ERROR_SCALE = 0.1
-"""Differences from this share of the full range up get the brightest colour. All maps use the same scale, so that two pages can
-be compared. At a fidelity of 40 dB a typical difference is a tenth of it, and half of it at edges."""
-FLIP_SCALE = 0.5
-"""FLIP from this value up gets the brightest colour. At a drop of 1 dB a typical pixel has a tenth to a fifth of it, and one in a
-hundred 0.15 to 0.3."""
-# Brightness rises evenly, so that the map can also be read in grey.
-_STOPS = ((8, 6, 20), (74, 24, 110), (176, 50, 92), (240, 120, 40), (255, 206, 90), (255, 252, 232))
 
 
 def ramp() -> np.ndarray:

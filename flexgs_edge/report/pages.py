@@ -27,6 +27,10 @@ FAR = 0.35
 """The scene's points widen the plan by at most this share of the cameras' extent. Some scenes reach to the horizon."""
 MOST_NAMES = 400
 """With more cameras than this, plans leave out the names that a pointer would show, so that pages stay small."""
+# As wide as a phone, so that text stays readable there. On larger screens the chart and its text grow together.
+WIDTH, HEIGHT = 360, 230
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44, WIDTH - 12, 14, HEIGHT - 38
+FEW_ROWS = 16  # With more steps than this, their table is folded up. With more views, their table scrolls.
 
 
 def plans(rig: Rig, numbers: Mapping[str, int]) -> str:
@@ -143,11 +147,6 @@ def _dots(points: np.ndarray, height: float) -> list[tuple[int, int]]:
     return list(dict.fromkeys((round(x), round(y)) for x, y in inside))
 
 
-# As wide as a phone, so that text stays readable there. On larger screens the chart and its text grow together.
-WIDTH, HEIGHT = 360, 230
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44, WIDTH - 12, 14, HEIGHT - 38
-
-
 def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
     """Draw file size against the deciding figure, with one mark per step.
 
@@ -210,9 +209,6 @@ def nice_range(values: Sequence[float], most: int = 5) -> tuple[float, float, li
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * (1 - 1e-9))
     first, last = math.ceil(low / step), math.floor(high / step)
     return low, high, [round(index * step, 12) for index in range(first, last + 1)]
-
-
-FEW_ROWS = 16  # With more steps than this, their table is folded up. With more views, their table scrolls.
 
 
 def compress_page(result: CompressResult, material: Material) -> str:

@@ -24,6 +24,8 @@ from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
 
+LOG = logging.getLogger("flexgs_edge")
+
 
 def companions_of(path: str | os.PathLike[str]) -> Companions:
     """Find cameras, photos and drawing settings beside the scene at `path`, and log the cameras and photos found."""
@@ -53,8 +55,6 @@ def merge_companions(first: Companions, second: Companions) -> Companions:
 
 
 Options = TypeVar("Options", bound=ViewOptions)
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 @dataclass(frozen=True)

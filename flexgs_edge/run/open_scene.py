@@ -39,7 +39,7 @@ def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> S
 
     A folder that holds a `point_cloud.ply` stands for it.
 
-    Returns with its axes in RDF. Raises `InputError` if the path does not exist or its suffix is unknown. Raises
+    What it returns has its axes in RDF. Raises `InputError` if the path does not exist or its suffix is unknown. Raises
     `FormatError` if the file does not follow its format.
     """
     return open_file(path, reading).source

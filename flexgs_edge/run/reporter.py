@@ -33,6 +33,9 @@ from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
 
+LOG = logging.getLogger("flexgs_edge")
+
+
 MOST_SHOTS = 5
 """A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
 MOST_WIDTH = 800  # Wider pictures are scaled down to this many pixels: sharp on a phone, and a page of a few MB at most
@@ -43,6 +46,7 @@ JPEG_QUALITY = 95
 """High enough that pictures differ by our compression and not by JPEG: docs/results/tuning.md#jpeg_quality"""
 ERROR_QUALITY = 85
 MOST_POINTS = 1500  # The camera plans show the scene as at most this many of its Gaussians
+PAGE, RECORD = "index.html", "result.json"
 
 
 def shown_size(camera: Camera) -> tuple[int, int]:
@@ -135,11 +139,6 @@ def rig_of(views: ViewSet, source: SceneSource) -> Rig:
         held_out=frozenset(views.held_out),
         points=means.T.astype(np.float64) + source.origin,
     )
-
-
-LOG = logging.getLogger("flexgs_edge")
-
-PAGE, RECORD = "index.html", "result.json"
 
 
 class Reporter:

@@ -63,7 +63,7 @@ def view_warnings(
 
     `views`: all views of the run. `scored`: numbers of scored views and of unseen Gaussians; `None` if the search
     measured no costs. `count`: Gaussians of the scene. `trained`, `held_out`: mean fidelity on training views and on
-    held-out views, dB; `None` if not measured. Returns empty if there is nothing to warn of.
+    held-out views, dB; `None` if not measured.
     """
     found = []
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:

@@ -25,6 +25,7 @@ cache."""
 
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
 """SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""
+SAMPLE_ROWS = 4096  # Most Gaussians whose positions tell which poses see which part of a scene, and how much of it
 
 
 class SceneSource(ABC):
@@ -293,9 +294,6 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
     cuts = np.flatnonzero(np.diff(chunks, prepend=-1))
     for start, stop in zip(cuts.tolist(), [*cuts[1:].tolist(), len(rows)], strict=True):
         yield int(chunks[start]), rows[start:stop], slice(start, stop)
-
-
-SAMPLE_ROWS = 4096  # Most Gaussians whose positions tell which poses see which part of a scene, and how much of it
 
 
 def some_positions(source: SceneSource, most: int = SAMPLE_ROWS) -> np.ndarray:

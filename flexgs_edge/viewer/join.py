@@ -11,6 +11,11 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 
 _SHADER = re.compile(r"`#version[^`]*`")
+_IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
+_EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
+_NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
+_LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 
 
 def shorten_script(text: str) -> str:
@@ -36,13 +41,6 @@ def _shorten_shader(text: str) -> str:
     """Without comments, indentation and spaces beside signs; not beside + and -, two of which would become another sign."""
     lines = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
     return re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", lines)
-
-
-_IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
-_EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
-_EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
-_NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
-_LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 
 
 def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:

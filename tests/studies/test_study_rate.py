@@ -1,4 +1,4 @@
-"""`study rate` on a tiny scene: points against the pipeline's own runs, parts taken away, bytes and losses read off a curve."""
+"""`study rate` on a tiny scene: points against the pipeline's own runs, bytes and losses read off a curve."""
 
 from __future__ import annotations
 

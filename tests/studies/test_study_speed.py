@@ -1,4 +1,4 @@
-"""`study speed` on a tiny scene: what is drawn less exactly, scored from fewer views, run whole; and its front."""
+"""`study speed` on a tiny scene: runs of compress, and their front."""
 
 from __future__ import annotations
 

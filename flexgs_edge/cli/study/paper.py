@@ -12,15 +12,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @click.command(cls=help_page.SectionCommand)
 @click.argument("scenes", metavar="SCENE...", type=click.Path(), nargs=-1, required=True)
 @shared_options.results_option
-@help_page.option(
-    "Search",
-    "--max-drop",
-    metavar="DB",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Loss of PSNR that the search aims at: against the photos, else estimated.",
-)
+@shared_options.study_target_option
 @shared_options.study_options
 def command(scenes: tuple[str, ...], output: str, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Repeat the FlexGaussian paper's experiments on your scenes.

@@ -32,19 +32,13 @@ RATIOS = RatiosType()
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
 @help_page.option(
-    "Points",
-    "--ratios",
-    type=RATIOS,
-    default="8,16,32,64,128,256",
-    show_default=True,
-    help="Ratios to the .ply that both methods aim at.",
+    "Points", "--ratios", type=RATIOS, default="8,16,32,64,128,256", help="Ratios to the .ply that both methods aim at."
 )
 @help_page.option(
     "Points",
     "--effort",
     type=click.Choice(["fast", "balanced"]),
     default="balanced",
-    show_default=True,
     help="Effort of the search at these ratios, as for compress.",
 )
 @shared_options.study_options

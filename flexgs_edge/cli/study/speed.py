@@ -12,15 +12,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @click.command(cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
-@help_page.option(
-    "Points",
-    "--max-drop",
-    metavar="DB",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Loss of PSNR that runs aim at.",
-)
+@shared_options.study_target_option
 @shared_options.study_options
 def command(scene: str, output: str, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Chart the time of a run against the ratio that it finds.

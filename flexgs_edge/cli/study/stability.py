@@ -13,15 +13,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
 @help_page.option("Points", "--quick", is_flag=True, help="Fewer points and small views: much faster, less exact.")
-@help_page.option(
-    "Points",
-    "--max-drop",
-    metavar="DB",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Loss of PSNR that compressed results aim at.",
-)
+@shared_options.study_target_option
 @shared_options.study_options
 def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: bool, **options: Any) -> None:
     """Find where methods break on a scene.

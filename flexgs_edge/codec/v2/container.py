@@ -30,6 +30,8 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 
 BOXES = "boxes"  # Its name among the settings of a file
 FEWEST, MOST = 8, 4096  # Fewer chunks come one after the other anyway; of more, the header would grow too long
+VERSION = 2
+__all__ = ["GridContainer", "Preview", "channel_bytes", "coded_size", "trim_container", "verify_grid", "write_grid"]
 
 
 def with_boxes(settings: Mapping[str, Any], grid: GridScene, chunks: Sequence[Chunk]) -> dict[str, Any]:
@@ -63,8 +65,6 @@ def decode_chunk(
         check_end(data, rows, stream.finish())
     return codes
 
-
-VERSION = 2
 
 Result = TypeVar("Result")
 
@@ -357,6 +357,3 @@ def channel_bytes(
     table["preview"] = float(container.header.preview.length)
     table["header"] = float(container.size - payload) - table["model"] - table["preview"]
     return table
-
-
-__all__ = ["GridContainer", "Preview", "channel_bytes", "coded_size", "trim_container", "verify_grid", "write_grid"]

@@ -33,6 +33,12 @@ _UNSEEN = 0.25
 _UNIT = 2.0**-20
 """Bits are counted in these units. Sums are then exact, and the last digit of a logarithm, in which machines differ, decides
 nothing."""
+SAMPLE_CHUNKS = 4
+"""Chunks that the predictions are fitted to; the tables count the symbols of all chunks. With fewer, layers of a small file
+are left out: docs/results/tuning.md#codec"""
+SAMPLE_ROWS = 24576
+"""Rows of these chunks that the fit uses, or up to twice as many. All rows would take longer and save hardly a bit:
+docs/results/tuning.md#codec"""
 
 
 def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -113,14 +119,6 @@ def cheapest_path(bits: np.ndarray, prices: np.ndarray) -> np.ndarray:
     for back in reversed(came):
         path.append(int(back[path[-1]]))
     return np.array(path[::-1], np.uint8)
-
-
-SAMPLE_CHUNKS = 4
-"""Chunks that the predictions are fitted to; the tables count the symbols of all chunks. With fewer, layers of a small file
-are left out: docs/results/tuning.md#codec"""
-SAMPLE_ROWS = 24576
-"""Rows of these chunks that the fit uses, or up to twice as many. All rows would take longer and save hardly a bit:
-docs/results/tuning.md#codec"""
 
 
 def cells_of(grid: GridScene, storage: Storage = IN_MEMORY) -> tuple[np.ndarray, np.ndarray, int]:

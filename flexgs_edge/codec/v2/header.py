@@ -26,6 +26,27 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 
 COUNT_MOST = 2**53 - 1  # Largest number of bytes or rows: every JSON reader keeps integers up to here exactly
+HEADER_MOST = 1 << 20
+MODEL_MOST = 1 << 20  # Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less
+LAYERS_MOST = 256
+PREVIEW_MOST = 1 << 24
+PREVIEW_KEY = len(',"preview_bytes":16777216')
+"""Most bytes of a preview, and most bytes by which it makes the header longer."""
+_KEYS = (
+    "chunk_rows",
+    "count",
+    "cut_from",
+    "depth",
+    "layers",
+    "low",
+    "model_bytes",
+    "origin",
+    "settings",
+    "sh_degree",
+    "steps",
+)
+_OPTIONAL = "channels", "preview_bytes"
+__all__ = ["GridHeader", "decode_header", "encode_header", "least_bytes"]
 
 
 @dataclass(frozen=True)
@@ -48,29 +69,6 @@ def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
     parts |= {name: tuple(f"{name} {axis}" for axis in "xyz") for name in ("scale", "rotation")}
     parts |= {"opacity": ("opacity",), "dc": ("dc Y", "dc Co", "dc Cg"), "sh degree": ("sh degree",)}
     return parts | {f"sh {d}": tuple(f"sh {d} {c}" for c in ("Y", "Co", "Cg")) for d in range(1, sh_degree + 1)}
-
-
-HEADER_MOST = 1 << 20
-MODEL_MOST = 1 << 20  # Most bytes of the model; 59 alphabets of 256 symbols and 64 tables need less
-LAYERS_MOST = 256
-PREVIEW_MOST = 1 << 24
-PREVIEW_KEY = len(',"preview_bytes":16777216')
-"""Most bytes of a preview, and most bytes by which it makes the header longer."""
-
-_KEYS = (
-    "chunk_rows",
-    "count",
-    "cut_from",
-    "depth",
-    "layers",
-    "low",
-    "model_bytes",
-    "origin",
-    "settings",
-    "sh_degree",
-    "steps",
-)
-_OPTIONAL = "channels", "preview_bytes"
 
 
 @dataclass(frozen=True)
@@ -279,6 +277,3 @@ def _integers(name: str, value: object, lowest: int, highest: int) -> tuple[int,
     if not isinstance(value, list):
         raise HeaderError(f"{name}: wanted a list of integers, got {shown(value)}")
     return tuple(checked_integer(name, number, lowest, highest) for number in value)
-
-
-__all__ = ["GridHeader", "decode_header", "encode_header", "least_bytes"]

@@ -21,6 +21,35 @@ REACH = (4, 2)
 """Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which
 saves time and costs few bits: docs/results/tuning.md#codec"""
 ONE = 256  # Features are integers in units of 1/256 of a code
+AXES = ("x", "y", "z")
+COLOURS = ("Y", "Co", "Cg")
+_OWN = 3  # Number of features from the channel's own neighbours: mean, spread and distance
+_NEAR = (2,)  # Place of the distance's weight
+_SCALES = ("scale x", "scale y", "scale z")
+_EARLIER: dict[str, tuple[str, ...]] = {
+    "scale x": (),
+    "scale y": ("scale x",),
+    "scale z": ("scale x", "scale y"),
+    "opacity": _SCALES,
+    "dc Y": ("opacity", *_SCALES),
+    "dc Co": ("dc Y", "opacity"),
+    "dc Cg": ("dc Y", "dc Co"),
+    "sh degree": ("opacity", "dc Y", "dc Co", "dc Cg"),
+    "rotation x": _SCALES,
+    "rotation y": _SCALES,
+    "rotation z": _SCALES,
+}  # Base channels in order, and the earlier channels that predict each of them
+_SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
+"""Channels that predict others. Each gives three features in this order: value, neighbours' mean, distance."""
+_SH_SOURCES = ("opacity", *_SCALES)
+"""Channels that predict SH. Opacity and scale tell how strongly a row's light changes; rotations tell little."""
+_SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
+"""Places of weights for features of the same coefficient and those before, for the planes Y, Co and Cg. The features
+are the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the
+first."""
+_RESIDUAL = ("scale", "opacity", "dc")
+"""Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their
+values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,38 +141,6 @@ def limited(values: np.ndarray) -> np.ndarray:
     """Clip values [n] to the range that predictions use, as f32."""
     kept: np.ndarray = values.astype(np.float32)
     return np.clip(kept, np.float32(-VALUE_LIMIT), np.float32(VALUE_LIMIT), out=kept)
-
-
-AXES = ("x", "y", "z")
-COLOURS = ("Y", "Co", "Cg")
-_OWN = 3  # Number of features from the channel's own neighbours: mean, spread and distance
-_NEAR = (2,)  # Place of the distance's weight
-
-_SCALES = ("scale x", "scale y", "scale z")
-_EARLIER: dict[str, tuple[str, ...]] = {
-    "scale x": (),
-    "scale y": ("scale x",),
-    "scale z": ("scale x", "scale y"),
-    "opacity": _SCALES,
-    "dc Y": ("opacity", *_SCALES),
-    "dc Co": ("dc Y", "opacity"),
-    "dc Cg": ("dc Y", "dc Co"),
-    "sh degree": ("opacity", "dc Y", "dc Co", "dc Cg"),
-    "rotation x": _SCALES,
-    "rotation y": _SCALES,
-    "rotation z": _SCALES,
-}  # Base channels in order, and the earlier channels that predict each of them
-_SOURCES = ("scale x", "scale y", "scale z", "opacity", "dc Y", "dc Co", "dc Cg")
-"""Channels that predict others. Each gives three features in this order: value, neighbours' mean, distance."""
-_SH_SOURCES = ("opacity", *_SCALES)
-"""Channels that predict SH. Opacity and scale tell how strongly a row's light changes; rotations tell little."""
-_SH_BEFORE = ((3,), (11, 3, 9, 10), (3, 13, 14, 9, 10, 11, 12))
-"""Places of weights for features of the same coefficient and those before, for the planes Y, Co and Cg. The features
-are the sums of |Cg|, |Y|, |Co| so far, then Y, |Y|, Co, |Co|. Y and Co use them from the second on, Cg from the
-first."""
-_RESIDUAL = ("scale", "opacity", "dc")
-"""Channels whose symbols are residuals: they are predictable and have no sharp limits. Other channels code their
-values."""
 
 
 def base_kinds() -> list[GroupKind]:

@@ -29,6 +29,7 @@ from flexgs_edge.views.sums import Maker, ViewSums
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
 """Sums of moments saturate here. Only colours of some thousands in every view reach it."""
+PART_NAMES = ("removal", "weight2", "moments")  # Arrays of `CostParts`
 
 
 @dataclass
@@ -89,9 +90,6 @@ class CostParts:
 def cost_bytes(sh_degree: int) -> int:
     """Bytes a row that `cost_sums` take on the backend."""
     return 32 * (1 + sh_degree)
-
-
-PART_NAMES = ("removal", "weight2", "moments")  # Arrays of `CostParts`
 
 
 def cost_sums(renderer: Renderer, degree: int, first: int = 0) -> Maker:

@@ -54,6 +54,12 @@ many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
+FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
+FINE_COLOUR = 2.0**-8
+"""Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
+PRICED, ABOVE = -0.035, 0.02
+"""Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
+results that are too large can be trimmed: docs/results/tuning.md#landing"""
 
 
 def fits(most: int) -> list[float]:
@@ -94,14 +100,6 @@ class Descents:
             return excess + math.log(DISTILLED)
         behind = BEHIND + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
         return (left + excess) / 2 + behind
-
-
-FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
-FINE_COLOUR = 2.0**-8
-"""Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
-PRICED, ABOVE = -0.035, 0.02
-"""Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
-results that are too large can be trimmed: docs/results/tuning.md#landing"""
 
 
 Choose = Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]

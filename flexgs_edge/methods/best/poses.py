@@ -25,6 +25,27 @@ STEP = 4  # Every fourth pixel in both directions is compared
 POWER = 4.8
 """Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
 does: docs/results/tuning.md#view_weights"""
+EVERY, BETWEEN = 8, 7
+"""Of `EVERY` given poses, the first and fifth get a nearer one, the third and seventh a farther one, and number `BETWEEN` one
+half way to its nearest neighbour: docs/results/tuning.md#margin. They come on top of the given poses; in place of them they
+would make files larger."""
+TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
+LEAST_GAIN = 0.2
+"""A pose is needed if it adds at least this share of its own picture to what the scored ones see:
+docs/results/tuning.md#needed"""
+GAIN_DIGITS = 4  # Decimals in comparisons of what a pose adds
+NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half way between them, if that is needed
+BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
+MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
+POINTS = 512  # Most points that tell what poses see
+FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
+"""Targets stricter than these (dB, dB, compression ratio) keep most SH of most Gaussians. Colours then have as many values
+as a part of the pixels, and a refit to that part would overfit. So such targets get every pixel of as many poses as the
+effort allows: docs/results/tuning.md#fine_drop"""
+COVERAGE_POSES = 32
+"""Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
+BESIDE_FINER = 2.0
+"""How much finer than in the mean we look at poses beside a view that lost too much: docs/results/tuning.md#needed"""
 
 
 @dataclass(frozen=True)
@@ -78,13 +99,6 @@ def view_weights(slopes: np.ndarray) -> np.ndarray:
     return relative
 
 
-EVERY, BETWEEN = 8, 7
-"""Of `EVERY` given poses, the first and fifth get a nearer one, the third and seventh a farther one, and number `BETWEEN` one
-half way to its nearest neighbour: docs/results/tuning.md#margin. They come on top of the given poses; in place of them they
-would make files larger."""
-TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
-
-
 def margin_of(
     renderer: Renderer, source: SceneSource, poses: Sequence[Camera], cameras: Sequence[Camera]
 ) -> list[Camera]:
@@ -104,16 +118,6 @@ def margin_of(
             away = [float(np.square(other.center - camera.center).sum()) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
     return made
-
-
-LEAST_GAIN = 0.2
-"""A pose is needed if it adds at least this share of its own picture to what the scored ones see:
-docs/results/tuning.md#needed"""
-GAIN_DIGITS = 4  # Decimals in comparisons of what a pose adds
-NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half way between them, if that is needed
-BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
-MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
-POINTS = 512  # Most points that tell what poses see
 
 
 def needed_poses(
@@ -209,16 +213,6 @@ def _pairs(
         if _gain(own, _known(own, there)) >= LEAST_GAIN:
             found += [(given[place], view) for place in nearest(view, given, BESIDE)]
     return found
-
-
-FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
-"""Targets stricter than these (dB, dB, compression ratio) keep most SH of most Gaussians. Colours then have as many values
-as a part of the pixels, and a refit to that part would overfit. So such targets get every pixel of as many poses as the
-effort allows: docs/results/tuning.md#fine_drop"""
-COVERAGE_POSES = 32
-"""Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
-BESIDE_FINER = 2.0
-"""How much finer than in the mean we look at poses beside a view that lost too much: docs/results/tuning.md#needed"""
 
 
 @dataclass(frozen=True)

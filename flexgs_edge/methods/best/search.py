@@ -19,9 +19,24 @@ from flexgs_edge.goals.promise import lost_views
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 
+LOG = logging.getLogger("flexgs_edge")
+
+
 NEAREST = 0.1
 """A new point keeps this share of the interval between its neighbours away from both, since curves are not quite
 smooth."""
+MOST, MOST_TRIED = 4, 6
+"""Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
+of both."""
+PROBES = 4  # Most probes before the first candidate
+AIM, FARTHER = -0.01, 0.05
+"""Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
+SLOPE, SIZE_SLOPE = 0.7, -0.45
+"""Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
+docs/results/tuning.md#slope"""
+LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what is measured
+CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than this ends a search for a size
+LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
 def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.2) -> float:
@@ -69,21 +84,7 @@ def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     ]
 
 
-LOG = logging.getLogger("flexgs_edge")
-
 Product = TypeVar("Product")  # Type of the product of a candidate: a grid, or a finished file
-
-MOST, MOST_TRIED = 4, 6
-"""Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
-of both."""
-PROBES = 4  # Most probes before the first candidate
-AIM = -0.01  # Log of the share that we aim at
-SLOPE, SIZE_SLOPE = 0.7, -0.45
-"""Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
-docs/results/tuning.md#slope"""
-LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what is measured
-CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than this ends a search for a size
-LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
 @dataclass(frozen=True)
@@ -221,8 +222,9 @@ def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     """
     by_size = target.limit_bytes is not None
     slope = SIZE_SLOPE if by_size else SLOPE
+    misses = next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
     points = [(math.log(step.multiplier), step.excess) for step in steps]
-    place = next_point(weighed(points), slope, LARGEST_STRIDE)
+    place = next_point(weighed([(at, excess + FARTHER * misses) for at, excess in points]), slope, LARGEST_STRIDE)
     low, high = _bracket(points, slope)
     place = min(max(place, low), high)
     return place if place > math.log(1e-30) and all(abs(place - at) > LEAST_CHANGE for at, _ in points) else None

@@ -22,6 +22,10 @@ MOST_ROUNDS = 24  # Most rounds of pruning
 FEW = 16  # Of fewer Gaussians none goes in a round
 ALL_LEFT = 0.97
 """A multiplier that keeps this share of what a descent has left asks for more: it chooses from what there was before."""
+MARGIN_FROM = 1.0
+"""Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
+PRUNED_PART = 0.45
+"""Share of the allowed loss that pruning alone uses up when a candidate meets the target: docs/results/tuning.md#pruned_part"""
 
 
 @dataclass
@@ -100,12 +104,6 @@ class Selection:
             if keep.mean() >= self.keep or snapshot.count < FEW:
                 break
         return index, keep, degrees
-
-
-MARGIN_FROM = 1.0
-"""Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
-PRUNED_PART = 0.45
-"""Share of the allowed loss that pruning alone uses up when a candidate meets the target: docs/results/tuning.md#pruned_part"""
 
 
 class Measure(Protocol):

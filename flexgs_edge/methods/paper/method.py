@@ -35,7 +35,12 @@ from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
 from flexgs_edge.views.render_context import RenderContext
 
+LOG = logging.getLogger("flexgs_edge")
+
+
 SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
+RANK_ROW_BYTES = 36
+"""Bytes a Gaussian of orders, ranks, numbers of rows with SH, and rows of one choice. Scores, made before, take less."""
 
 
 def bits_by_sensitivity(
@@ -58,12 +63,6 @@ def bits_by_sensitivity(
     judge.close()
     LOG.info("bits found by sensitivity: %s", bits)
     return bits, found
-
-
-LOG = logging.getLogger("flexgs_edge")
-
-RANK_ROW_BYTES = 36
-"""Bytes a Gaussian of orders, ranks, numbers of rows with SH, and rows of one choice. Scores, made before, take less."""
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,14 @@ PRIOR_WEIGHT = 1e-3
 """Weight of the prior slopes, in measured points at the limit. They decide only where points leave a slope open."""
 WIDTH = 0.5
 """Excess at which a measured point weighs 1/e of one at the limit, because the model need only be right near the limit."""
+CANDIDATES: tuple[tuple[int, int], ...] = (
+    (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
+    (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
+)  # fmt: skip
+"""The paper's list of (p, s), in tenths, as published. It is not sorted by bytes; the search sorts it."""
+START = (4, 4)  # Where the walk along the list begins, in tenths
+GRID = 20  # Step of the refinement in p and s, in thousandths
+REACH = 100  # Largest distance of the refinement from the list's answer, in thousandths
 
 
 @dataclass(frozen=True)
@@ -68,16 +76,6 @@ class LossModel:
     def predict(self, choice: Choice) -> float:
         """Expected excess at `choice`."""
         return self.constant + (self.prune * choice.prune + self.sh * choice.sh) / 1000.0
-
-
-CANDIDATES: tuple[tuple[int, int], ...] = (
-    (2, 3), (1, 5), (2, 4), (3, 3), (1, 6), (2, 5), (3, 4), (4, 3), (2, 6), (3, 5),
-    (4, 4), (3, 6), (4, 5), (5, 4), (6, 3), (5, 5), (6, 4), (7, 3), (8, 2), (9, 1),
-)  # fmt: skip
-"""The paper's list of (p, s), in tenths, as published. It is not sorted by bytes; the search sorts it."""
-START = (4, 4)  # Where the walk along the list begins, in tenths
-GRID = 20  # Step of the refinement in p and s, in thousandths
-REACH = 100  # Largest distance of the refinement from the list's answer, in thousandths
 
 
 class Evaluator(Protocol):

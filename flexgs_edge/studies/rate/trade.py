@@ -15,6 +15,7 @@ LEAST_LOSS = 0.001
 """Points with less loss than this, in dB, are left out. Loss and bytes are interpolated on log scales, because such curves are
 nearly power laws."""
 SLACK = 1e-9  # Tolerance, so that the curve's own points lie on it in spite of rounding
+FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
 
 class Curve:
@@ -46,9 +47,6 @@ class Curve:
             return float(np.exp(self._sizes[0]))
         ends = slice(after - 1, after + 1)
         return float(np.exp(np.interp(-place, -self._losses[ends], self._sizes[ends])))
-
-
-FIDELITY_WORDS = "fidelity: PSNR against the original's renders"
 
 
 def rate(studied: StudyScene, points: Sequence[RatePoint], missing: Sequence[str], effort: str) -> Experiment:

@@ -20,8 +20,7 @@ from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
 
 LOG = logging.getLogger("flexgs_edge")
 
-PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))
-"""Method and effort of each run."""
+PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
 
 
 class SpeedStudy(WrittenStudy):

@@ -36,6 +36,13 @@ from flexgs_edge.studies.study_scene import Setting, StudyScene
 
 BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"
+BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
+MARGIN = "best, --views-margin"
+WORDS = (
+    f"best and paper: the results at the study's target. {MARGIN}: generated poses are scored too. {RTN}: one "
+    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, with only Gaussians or only SH removed by gs, to "
+    "paper's bytes or as near as possible."
+)
 
 
 def view_loss(studied: StudyScene, view: ViewQuality) -> float:
@@ -133,15 +140,6 @@ def _search(studied: StudyScene, rounds: PruneRounds, judge: QualityEvaluator, r
 def _whole(made: GridMaker, grid: GridScene, multiplier: float, reached: bool) -> Whole:
     rows = made.rounds.scene_rows(made.selection.kept(multiplier).rows)
     return Whole(grid, coded_size(grid, {}), multiplier, rows, reached)
-
-
-BEST, PAPER, RTN, ROWS, SH = "best", "paper", "RTN, 8 bits", "rows only", "SH only"
-MARGIN = "best, --views-margin"
-WORDS = (
-    f"best and paper: the results at the study's target. {MARGIN}: generated poses are scored too. {RTN}: one "
-    f"range a channel, nothing removed. {ROWS}, {SH}: the paper's bits, with only Gaussians or only SH removed by gs, to "
-    "paper's bytes or as near as possible."
-)
 
 
 class Contenders:

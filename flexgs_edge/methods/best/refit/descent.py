@@ -24,6 +24,16 @@ from flexgs_edge.units import format_mib
 PRICES = 33  # Values of the record that the kernel `descend` takes
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
+ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
+"""Fields in the order of a gradient's planes (cl_kernels/values.clh)."""
+DECAYS = (0.9, 0.99)
+"""Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
+a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
+WIDE = 0.055
+"""A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
+steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
+PLANE_SETS = 5  # How often all planes of a chunk are held: values and their mean, gradient, two running means of it
+GRID_VALUES = 14  # Step sizes that the kernel `snap` takes
 
 
 def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: float) -> np.ndarray:
@@ -75,17 +85,6 @@ def _luma_and_chroma(colours: np.ndarray) -> np.ndarray:
     """Y, Co and Cg ([3, ...] f64) of red, green and blue."""
     red, green, blue = colours.astype(np.float64)
     return np.stack([(red + 2 * green + blue) / 4, red - blue, green - (red + blue) / 2])
-
-
-ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
-"""Fields in the order of a gradient's planes (cl_kernels/values.clh)."""
-DECAYS = (0.9, 0.99)
-"""Decay of Adam's running means of gradients and of their squares. The usual 0.999 of the second would remember longer than
-a descent of a few hundred views lasts: docs/results/tuning.md#decays"""
-WIDE = 0.055
-"""A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
-steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
-PLANE_SETS = 5  # How often all planes of a chunk are held: values and their mean, gradient, two running means of it
 
 
 def widths(sh_degree: int) -> dict[str, int]:
@@ -200,9 +199,6 @@ def fields_of(planes: dict[str, np.ndarray], own: dict[str, int]) -> Iterator[tu
             values = values.reshape(3, len(values) // 3, values.shape[1])[:, : width // 3]
         yield name, slice(at, at + width), values
         at += width
-
-
-GRID_VALUES = 14  # Step sizes that the kernel `snap` takes
 
 
 def descent_bytes(sh_degree: int) -> int:

@@ -36,6 +36,10 @@ from flexgs_edge.render.fit import GRADIENT_SUMS, RAW_BYTES, Fit, padded, plane_
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import MemorySource, SceneSource
 
+CHUNK_ROWS = 1 << 14
+"""Most rows of a chunk: 4 MB of values at SH degree 3. Larger ones would hold more rows that a view does not show."""
+RECORD = 16  # Values of a splat's record
+
 
 @dataclass
 class Part:
@@ -125,11 +129,6 @@ def parts_of(spans: Iterable[tuple[int, int, int]]) -> list[Part]:
         parts.append(Part(start, stop - start, degree, at, powers_at))
         at, powers_at = parts[-1].span.stop, parts[-1].powers_span.stop
     return parts
-
-
-CHUNK_ROWS = 1 << 14
-"""Most rows of a chunk: 4 MB of values at SH degree 3. Larger ones would hold more rows that a view does not show."""
-RECORD = 16  # Values of a splat's record
 
 
 def open_descent(
