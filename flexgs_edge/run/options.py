@@ -202,8 +202,8 @@ class CompressOptions(ViewOptions):
         Bits per attribute, `paper`, `auto`, or `rtn4`, `rtn8`, ... (`paper`). Default: `paper`.
     groups : int, optional
         Quantization groups per channel (`paper`). Default: one group for about 512 rows.
-    base_psnr : float
-        Assumed PSNR of the original against its photos, for the modelled drop, dB.
+    base_psnr : float, optional
+        Assumed PSNR of the original against its photos, for the modelled drop, dB. Default: what its renders tell.
     trust_views : bool
         Go on with cameras and photos that do not fit the scene. Default: raise `InputError`.
     effort : {"fast", "balanced", "max"}
@@ -260,7 +260,7 @@ class CompressOptions(ViewOptions):
     sh_rate: float | None = None
     bits: str = "paper"
     groups: int | None = None
-    base_psnr: float = DEFAULT_BASE_PSNR
+    base_psnr: float | None = None
     trust_views: bool = False
     effort: str = "balanced"
     best_effort: bool = False
@@ -289,7 +289,7 @@ class CompressOptions(ViewOptions):
         ):
             if value not in known:
                 raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
-        if not 0.0 < self.base_psnr < 200.0:
+        if self.base_psnr is not None and not 0.0 < self.base_psnr < 200.0:
             raise InputError(
                 f"--base-psnr {self.base_psnr:g}: expected decibels between 0 and 200 (most scenes: 22 to 36)"
             )
@@ -386,7 +386,7 @@ class CompressOptions(ViewOptions):
             target = min_ratio(self.min_ratio, ply_bytes, figure)
         elif self.min_fidelity is not None:
             target = MinFidelity(self.min_fidelity)
-            allowed = modelled_drop(mse_of_psnr(self.min_fidelity), self.base_psnr)
+            allowed = modelled_drop(mse_of_psnr(self.min_fidelity), self.base_psnr or DEFAULT_BASE_PSNR)
         else:
             allowed = DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop
             target = MaxDrop(allowed, figure)

@@ -9,6 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.order import covering_order
+from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
 from flexgs_edge.methods.best.margin import margin_of
@@ -120,7 +121,9 @@ def scored_poses(
     errors = None
     if photo is not None:
         drop = options.max_drop or DEFAULT_MAX_DROP
-        errors = KnownErrors(deciding, base_errors(renderer, source, deciding, photo, options.base_psnr), drop)
+        errors = KnownErrors(
+            deciding, base_errors(renderer, source, deciding, photo, options.base_psnr or DEFAULT_BASE_PSNR), drop
+        )
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:
