@@ -278,7 +278,7 @@ class Stage:
     def in_order(self, chosen: list[Candidate]) -> list[Candidate]:
         """The chosen views in an order in which every `DEFAULT_HOLDOUT`-th one, from the first, lies between others.
 
-        These are evenly spread over the three quarters whose Gaussians the others show most.
+        These are evenly spread over the half whose Gaussians the others show most.
         """
         if not chosen:
             return []
@@ -292,7 +292,7 @@ class Stage:
             alone.append(float(np.rint(share * others).sum()) / max(float(share.sum()), 1.0))
         count = len(chosen)
         held = -(-count // DEFAULT_HOLDOUT)
-        among = np.argsort(alone, kind="stable")[: max(held, 3 * count // 4)]
+        among = np.argsort(alone, kind="stable")[: max(held, count // 2)]
         between = [int(among[turn * among.size // held]) for turn in range(held)]
         last, first = iter(between), iter([turn for turn in range(count) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(count)]
