@@ -123,7 +123,9 @@ def automatic_rig(
         for index, view in enumerate(chosen)
     ]
     near = float(f"{NEAR_PLANE * min(view.distance for view in chosen):.2g}")
-    return Rig(cameras, near, f"{_placed(scene, at)}; {found.note}")
+    seldom = round(stage.seldom * source.count)
+    hidden = f"; {seldom} Gaussians show only from behind, from below or through others" if seldom else ""
+    return Rig(cameras, near, f"{_placed(scene, at)}{hidden}; {found.note}")
 
 
 def _blind(scene: Witnesses) -> Candidate:

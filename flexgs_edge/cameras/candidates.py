@@ -33,7 +33,7 @@ the sharpest tenth shows and what is free. Real cameras' views lie within .1 of 
 beyond."""
 BLURRED_TIMES = 2.0
 """What is free for the width of splats in the view, a factor."""
-LEAST_SHARP, LEAST_WORTH = 0.05, 1e-3
+LEAST_SHARP, LEAST_WORTH = 0.1, 1e-3
 """Views that count less than this for what is too wide in them, or in all, are not taken at all."""
 GOOD = 0.1
 """Views are enough when they show what views show that are worth this share of the best, or more."""
@@ -112,6 +112,8 @@ class Stage:
         self.views: list[Candidate] = []
         self._most = np.zeros(scene.sizes.size)
         """The largest part of each Gaussian that any view shows, scene units squared."""
+        self.seldom = 0.0
+        """Share of the Gaussians that no good view shows."""
 
     def add_place(self, eye: np.ndarray, step: float) -> None:
         """Draw the views from a place ([3]) that should show most, if nothing hides it."""
@@ -236,6 +238,7 @@ class Stage:
                 most[view.rows] = np.maximum(most[view.rows], merit)
         stands = np.rint(16 * scene.stands)
         needed = stands * (fullest > 0)
+        self.seldom = 1 - float(needed.sum()) / max(float(stands.sum()), 1.0)
         fullest = np.where(fullest > 0, fullest, seldom)
         stands *= fullest > 0
         fullest = np.maximum(fullest, 1.0)
@@ -272,13 +275,14 @@ class Stage:
             apart += np.maximum(1 - turned, 0.0) * 8
             room *= np.rint(UNITS * (1 - 0.7 * np.exp(-0.5 * np.minimum(apart, 1000.0)))) / UNITS
             room[best] = bounds[best] = 0.0
+        self._worths = {id(view): float(each) for view, each in zip(self.views, worth)}
         self._shares = {id(view): merits[self.views.index(view)] / fullest[view.rows] for view in chosen}
         return chosen
 
     def in_order(self, chosen: list[Candidate]) -> list[Candidate]:
         """The chosen views in an order in which every `DEFAULT_HOLDOUT`-th one, from the first, lies between others.
 
-        These are evenly spread over the half whose Gaussians the others show most.
+        These are evenly spread over the half whose Gaussians the others show most, of the half that is worth most.
         """
         if not chosen:
             return []
@@ -292,7 +296,9 @@ class Stage:
             alone.append(float(np.rint(share * others).sum()) / max(float(share.sum()), 1.0))
         count = len(chosen)
         held = -(-count // DEFAULT_HOLDOUT)
-        among = np.argsort(alone, kind="stable")[: max(held, count // 2)]
+        worth = [-self._worths[id(view)] for view in chosen]
+        among = np.sort(np.argsort(worth, kind="stable")[: max(held, count // 2)])
+        among = among[np.argsort(np.array(alone)[among], kind="stable")][: max(held, count // 4)]
         between = [int(among[turn * among.size // held]) for turn in range(held)]
         last, first = iter(between), iter([turn for turn in range(count) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(count)]

@@ -111,8 +111,9 @@ def scored_poses(
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
-    # Without photos, poses are chosen for what they add: each is needed.
-    most = plan.views if fine or covered_decides else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
+    # Without photos, poses are chosen for what they add: all are needed.
+    pixels = [camera.width * camera.height for camera in ordered]
+    most = plan.views if fine or covered_decides else plan.poses_of(pixels, source.count)
     chosen, given = ordered[:most], {id(camera) for camera in cameras}
     if options.makes_poses:
         scored = [*chosen, *margin_of(renderer, source, chosen, cameras)]
