@@ -33,10 +33,12 @@ the sharpest tenth shows and what is free. Real cameras' views lie within .1 of 
 beyond."""
 BLURRED_TIMES = 2.0
 """What is free for the width of splats in the view, a factor."""
-LEAST_SHARP, LEAST_WORTH = 0.1, 1e-3
+LEAST_SHARP, LEAST_WORTH = 0.1, 1e-4
 """Views that count less than this for what is too wide in them, or in all, are not taken at all."""
 GOOD = 0.1
 """Views are enough when they show what views show that are worth this share of the best, or more."""
+DECIDING = 0.3
+"""Views that are worth less than this share of the best do not decide."""
 NEW, LEAST_NEW, NEW_SHARP = 0.1, 0.001, 0.3
 """Views that show at least the second share of the Gaussians, which all others together show less than the first, are taken
 however little they are worth, if they count so much for what is too wide in them."""
@@ -46,18 +48,18 @@ NEAR, NEAR_POWER = 0.3, 8
 """Light is from right before the lens if it comes from less than this share of the view's usual distance, from splats wider
 than WIDE. Views count by this power of the share of all other light."""
 WIDE = 0.1
-ENCLOSED_POWER = 2
+ENCLOSED_POWER = 1
 """Places with matter on more than half of all sides count by this power of it: inside a room, not behind its walls."""
 SHARP = 0.008
 """Usual deviation of a splat over its distance from a camera (4 pixels in a view 640 wide)."""
 SHARP_SPREAD = math.log(8.0)
 """One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same
 distance."""
-AGREEMENT_POWER = 3
+AGREEMENT_POWER = 2
 APART = 0.1
 """Views nearer to each other than this share of the distance of what they show add less."""
-FILLED = 0.3
-"""A view that matter fills less than this counts still less."""
+FILLED, FILLED_POWER = 0.3, 2
+"""Views that matter fills less than this, or less than the usual good one, count by this power of how much less."""
 FARTHEST = 1e9
 """Candidates farther away, in extents of the smallest part, are left out: float32 must hold them."""
 UNITS = 2.0**20
@@ -185,7 +187,7 @@ class Stage:
         part = weights * np.minimum(distance, 1e100) ** 2 * (pixels / (pixels + DILATION))
         np.maximum.at(self._most, rows, part)
         clear = (1 - before) ** NEAR_POWER * math.exp(-min((math.exp(min(blur, 50.0)) / BLURRED) ** 2, 600.0))
-        clear *= math.sqrt(filled) * min(filled / FILLED, 1.0) * max(0.5, sides) ** ENCLOSED_POWER
+        clear *= min(filled / FILLED, 1.0) ** FILLED_POWER * max(0.5, sides) ** ENCLOSED_POWER
         smear = float((light * scene.smear[rows]).sum()) / total / LOGS
         self.views.append(
             Candidate(
@@ -216,7 +218,8 @@ class Stage:
         over += np.maximum(blur - _quantile(blur, good, 0.2) - math.log(BLURRED_TIMES), 0.0)
         sharp = np.rint(UNITS * np.exp(-np.minimum(over / SMEAR, 600.0))) / UNITS
         self.sharp = sharp
-        worth = np.where(sharp >= LEAST_SHARP, clear * sharp, 0.0)
+        solid = np.minimum(filled / _quantile(filled, good, 0.5), 1.0) ** FILLED_POWER
+        worth = np.where(sharp >= LEAST_SHARP, clear * sharp * solid, 0.0)
         worth = np.rint(UNITS * worth / max(float(worth.max()), 1e-300)) / UNITS
         return np.where(worth >= LEAST_WORTH, worth, 0.0)
 
@@ -282,7 +285,7 @@ class Stage:
     def in_order(self, chosen: list[Candidate]) -> list[Candidate]:
         """The chosen views in an order in which every `DEFAULT_HOLDOUT`-th one, from the first, lies between others.
 
-        These are evenly spread over the half whose Gaussians the others show most, of the half that is worth most.
+        These are evenly spread over the half whose Gaussians the others show most, without views that are worth little.
         """
         if not chosen:
             return []
@@ -296,9 +299,8 @@ class Stage:
             alone.append(float(np.rint(share * others).sum()) / max(float(share.sum()), 1.0))
         count = len(chosen)
         held = -(-count // DEFAULT_HOLDOUT)
-        worth = [-self._worths[id(view)] for view in chosen]
-        among = np.sort(np.argsort(worth, kind="stable")[: max(held, count // 2)])
-        among = among[np.argsort(np.array(alone)[among], kind="stable")][: max(held, count // 4)]
+        rank = np.array(alone) + [2.0 * (self._worths[id(view)] < DECIDING) for view in chosen]
+        among = np.argsort(rank, kind="stable")[: max(held, count // 2)]
         between = [int(among[turn * among.size // held]) for turn in range(held)]
         last, first = iter(between), iter([turn for turn in range(count) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(count)]
