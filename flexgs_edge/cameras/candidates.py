@@ -21,8 +21,8 @@ SIDE = 80
 """Pixels along the side of a candidate's picture, a square of the same area as the view."""
 LEAST_ANGLE = 0.002
 """A Gaussian is shown well if its deviation is this, radians: a pixel of a view 640 wide."""
-LOOKED_AT, SIDES = 40.0, 3
-"""Distance of the places around one that is not, in its deviations, and their number."""
+LOOKED_AT = 40.0, 20.0, 10.0
+"""Distances of the places around one that is not, in its deviations."""
 LINES = 3
 """Most directions of view from a place."""
 TURNED = math.cos(math.radians(40.0))
@@ -39,7 +39,7 @@ GOOD = 0.1
 """Views are enough when they show what views show that are worth this share of the best, or more."""
 DECIDING = 0.3
 """Views that are worth less than this share of the best do not decide."""
-NEW, LEAST_NEW, NEW_SHARP = 0.1, 0.001, 0.3
+NEW, LEAST_NEW, NEW_SHARP = 0.5, 0.001, 0.3
 """Views that show at least the second share of the Gaussians, which all others together show less than the first, are taken
 however little they are worth, if they count so much for what is too wide in them."""
 BLURRED = 0.15
@@ -155,11 +155,11 @@ class Stage:
             if worth:
                 best[view.rows] = np.maximum(best[view.rows], view.close)
         missing = np.flatnonzero(best < _close(np.array([LEAST_ANGLE]))[0])
-        directions = fibonacci(SIDES * min(count, missing.size)).reshape(-1, SIDES, 3)
+        directions = fibonacci(len(LOOKED_AT) * min(count, missing.size)).reshape(-1, len(LOOKED_AT), 3)
         for place, lines in enumerate(directions):
             row = missing[place * missing.size // len(directions)]
-            distance = LOOKED_AT * float(scene.sizes[row])
-            for line in lines:
+            for line, times in zip(lines, LOOKED_AT):
+                distance = times * float(scene.sizes[row])
                 eye = scene.means[:, row] - line * distance
                 self._draw(eye, line, distance, filled_share(bins_of(_lines(scene.means, eye)[0])))
 
@@ -215,10 +215,12 @@ class Stage:
         )
         good = np.rint(UNITS * clear * filled / max(float((clear * filled).max()), 1e-300))
         over = np.maximum(smear - _quantile(smear, good, 0.1) - SMEAR_FREE, 0.0)
+        in_place = np.exp(-np.minimum(over / SMEAR, 600.0)) >= NEW_SHARP
         over += np.maximum(blur - _quantile(blur, good, 0.2) - math.log(BLURRED_TIMES), 0.0)
         sharp = np.rint(UNITS * np.exp(-np.minimum(over / SMEAR, 600.0))) / UNITS
-        self.sharp = sharp
         solid = np.minimum(filled / _quantile(filled, good, 0.5), 1.0) ** FILLED_POWER
+        self.last = in_place & (clear * solid >= LEAST_WORTH * float((clear * solid).max()))
+        """[V] bool, views that may be taken if nothing else shows what they show."""
         worth = np.where(sharp >= LEAST_SHARP, clear * sharp * solid, 0.0)
         worth = np.rint(UNITS * worth / max(float(worth.max()), 1e-300)) / UNITS
         return np.where(worth >= LEAST_WORTH, worth, 0.0)
@@ -235,8 +237,8 @@ class Stage:
         shows = [float((merit * np.rint(scene.stands[view.rows])).sum()) for merit, view in zip(merits, self.views)]
         self.strength = worth * np.array(shows)
         fullest, seldom = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
-        for view, merit, each in zip(self.views, merits, worth):
-            if each:
+        for view, merit, each, last in zip(self.views, merits, worth, self.last):
+            if each or last:
                 most = fullest if each >= GOOD else seldom
                 most[view.rows] = np.maximum(most[view.rows], merit)
         stands = np.rint(16 * scene.stands)
@@ -246,7 +248,8 @@ class Stage:
         stands *= fullest > 0
         fullest = np.maximum(fullest, 1.0)
         # A Gaussian counts with the root of what the best view shows of it: rare and faint ones are to be seen too.
-        root = np.rint(needed * np.sqrt(1024 / fullest))
+        # One that stands for many counts with their root: dense textures are not all there is to see.
+        root = np.rint(16 * np.sqrt(scene.stands) * (needed > 0) * np.sqrt(1024 / fullest))
         shown = np.zeros(fullest.size)
         room = np.ones(len(self.views))
         # The gain of a view only falls, so an older gain is an upper bound. Few views are looked at again for each one.
@@ -258,7 +261,7 @@ class Stage:
         while len(chosen) < (count or MOST_VIEWS) and bounds.any():
             enough = float(needed[shown >= 1].sum()) >= SHOWN * float(needed.sum())
             if count is None and not new_only and len(chosen) >= least and enough:
-                new_only, bounds = True, np.where((worth > 0) & (self.sharp >= NEW_SHARP), np.inf, 0.0)
+                new_only, bounds = True, np.where(self.last, np.inf, 0.0)
             wanted = stands * (shown < NEW) if new_only else np.rint(root / (1 + shown))
             fresh = np.zeros(len(self.views), bool)
             while not fresh[best := int(np.argmax(bounds))]:
