@@ -23,6 +23,7 @@ from .commands.score import score_gaussians as score_gaussians
 from .commands.trim import trim as trim
 from .commands.verify import verify as verify
 from .commands.view import view as view
+from .commands.views import draw_sheet as draw_sheet
 from .errors import BudgetError as BudgetError
 from .errors import DeviceError as DeviceError
 from .errors import FlexGSError as FlexGSError

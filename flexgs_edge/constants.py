@@ -185,8 +185,6 @@ CODE_LIMIT: Final = 1 << 24  # Largest magnitude of a code: float32 holds all of
 VOLUME_POWER: Final = 0.1  # Exponent of the Gaussian's volume in the gs and meson scores
 GROUP_ROWS: Final = 512  # Rows of a quantization group. The paper's 1000 groups take 528 kB for any number of rows.
 DEFAULT_BASE_PSNR: Final = 34.0
-"""Assumed PSNR in dB of a model against its photos, if there are none. It is cautious: most models have less, and lose
-less. A higher value can put the target out of reach, a lower one loses too much of a good model:
-docs/results/tuning.md#default_base_psnr"""
+"""Assumed PSNR in dB of a model against its photos, for views whose photo cannot judge."""
 DEFAULT_HOLDOUT: Final = 8  # Every 8th view by name is held out, the field's convention since Mip-NeRF 360
 MAX_VIEW_WIDTH: Final = 1600  # Wider views are scaled down to this width, as in the reference training program

@@ -68,7 +68,7 @@ class CompressWords(TypedDict, total=False):
     sh_rate: float | None
     bits: str
     groups: int | None
-    base_psnr: float
+    base_psnr: float | None
     trust_views: bool
     effort: str
     best_effort: bool

@@ -30,6 +30,13 @@ def bins_of(lines: np.ndarray) -> np.ndarray:
     return found
 
 
+def filled_share(bins: np.ndarray) -> float:
+    """Share of all directions, in parts of 4 x 4 bins, that hold some of `bins` ([n] int64)."""
+    side = FACE // 4
+    held = np.bincount(bins, minlength=BINS).reshape(6, side, 4, side, 4).any(axis=(2, 4))
+    return float(held.mean())
+
+
 class Frames:
     """Directions of view, and the bins that a frame around each holds.
 

@@ -1,30 +1,23 @@
-"""Places where a camera may stand: lattices in and around each part of a scene, without those in opaque matter."""
+"""Places where a camera may stand: lattices in and around each part of a scene, and around single splats if it is sparse."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.cameras.witnesses import Part, Witnesses
 
-LATTICE = 16
-"""Most candidates along the longest side of a lattice."""
-CANDIDATES = 6000
-"""Candidates of all lattices together, about. More lattices are coarser each."""
 MARGIN = 1.2
 """A lattice reaches so many half sides of its box to each side."""
 WIDER = (1, 2, 4)
 """Lattices of a core, in half sides of its box. Cameras often stood outside the dense core that they looked at."""
 BETWEEN = 1.5
 """Wider lattices end where they come this near to the size of the whole scene."""
-OPEN_DEPTH = 0.25
-"""Largest optical depth of a cell, along its side, in which a camera may stand."""
-CLOSE_UPS = 48
+CLOSE_UPS = 24
 """Splats that get places of their own, if the scene is sparse."""
-CLOSE_SIDES = 10
+CLOSE_SIDES = 4
 """Places around each of them."""
 CLOSE_DISTANCE = 5.5
 """Distance of these places in deviations of the splat. Three deviations to each side then fill the frame."""
@@ -32,55 +25,26 @@ SPARSE = 0.5
 """A scene is sparse if all its cross-sections together are less than this share of a circle around its box."""
 
 
-@dataclass(frozen=True)
-class Places:
-    """Candidates.
+def first_places(scene: Witnesses, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """About `count` candidates in and around the parts of a scene.
 
-    Attributes
-    ----------
+    Returns
+    -------
     at : np.ndarray
         [3, P] f64, positions relative to the scene's origin.
-    scale : np.ndarray
-        [P] f64, extent of the part of the scene that a place belongs to, scene units.
-    kind : np.ndarray
-        [P] int64, number of the lattice.
+    step : np.ndarray
+        [P] f64, distance to the next ones, scene units.
     """
-
-    at: np.ndarray
-    scale: np.ndarray
-    kind: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """Number of candidates."""
-        return self.scale.size
-
-    def take(self, rows: np.ndarray) -> Places:
-        """Some of the candidates."""
-        return Places(self.at[:, rows], self.scale[rows], self.kind[rows])
-
-
-def open_places(scene: Witnesses) -> Places:
-    """Candidates in and around each part of a scene, and around single splats if it is sparse."""
     boxes = _boxes(scene.parts)
-    side = min(LATTICE, math.floor((CANDIDATES / len(boxes)) ** (1 / 3) + 1e-9))
-    found = [_open(scene, _lattice(box, side)) for box in boxes]
-    scales = [np.full(at.shape[1], box.extent) for at, box in zip(found, boxes)]
+    found = [_lattice(box, count / len(boxes)) for box in boxes]
     if is_sparse(scene):
-        near, distances = _close_ups(scene)
-        found.append(near)
-        scales.append(distances)
-    return Places(
-        np.concatenate(found, axis=1),
-        np.concatenate(scales),
-        np.concatenate([np.full(at.shape[1], kind) for kind, at in enumerate(found)]),
-    )
+        found.append(_close_ups(scene))
+    return np.concatenate([at for at, _ in found], axis=1), np.concatenate([step for _, step in found])
 
 
 def is_sparse(scene: Witnesses) -> bool:
     """Say if a view of the whole scene would be almost empty."""
-    area = float((scene.weights * scene.sizes**2).sum()) * 2 * scene.share
-    return area < SPARSE * scene.whole.extent**2
+    return scene.area < SPARSE * scene.whole.extent**2
 
 
 def _boxes(parts: list[Part]) -> list[Part]:
@@ -93,27 +57,22 @@ def _boxes(parts: list[Part]) -> list[Part]:
     return boxes
 
 
-def _lattice(box: Part, side: int) -> np.ndarray:
-    """[3, n] f64, a cubic lattice in and around a box, with `side` places along the longest side."""
-    reach = (1 + MARGIN) * np.maximum(box.half, 0.5 * box.half.max())
-    step = 2 * float(reach.max()) / side
-    axes = [np.arange(-math.floor(r / step + 1e-9), math.floor(r / step + 1e-9) + 1) * step for r in reach]
-    lattice: np.ndarray = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1) + box.middle[:, None]
-    return lattice
-
-
-def _open(scene: Witnesses, places: np.ndarray) -> np.ndarray:
-    depth = scene.matter.optical_depth(places)
-    # If there is thin fog everywhere, the clearest quarter is the best there is.
-    kept: np.ndarray = places[:, depth <= max(OPEN_DEPTH, float(np.quantile(depth, 0.25)))]
-    return kept
+def _lattice(box: Part, count: float) -> tuple[np.ndarray, np.ndarray]:
+    """A cubic lattice of about `count` places in and around a box."""
+    reach = (1 + MARGIN) * np.maximum(box.half, 0.25 * box.half.max())
+    step = 2 * float(np.cbrt(reach.prod() / count))
+    axes = []
+    for half in reach:
+        sides = max(1, round(2 * float(half) / step))
+        axes.append((np.arange(sides) + 0.5) * (2 * float(half) / sides) - float(half))
+    at = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1) + box.middle[:, None]
+    return at, np.full(at.shape[1], step)
 
 
 def _close_ups(scene: Witnesses) -> tuple[np.ndarray, np.ndarray]:
-    """Places around the splats that show most: [3, n] f64, and their distances."""
-    order = np.argsort(-scene.weights * scene.sizes**2, kind="stable")[:CLOSE_UPS]
-    distances = CLOSE_DISTANCE * scene.sizes[order]
+    """Places around the splats that show most."""
+    order = np.argsort(-scene.sample.opacity * scene.sample.sizes**2, kind="stable")[:CLOSE_UPS]
+    distances = CLOSE_DISTANCE * scene.sample.sizes[order]
     offsets = fibonacci(CLOSE_SIDES).T
-    places = scene.means[:, order, None] + distances[:, None] * offsets[:, None]
-    around: np.ndarray = places.reshape(3, -1)
-    return around, np.repeat(distances, CLOSE_SIDES)
+    at = scene.sample.means[:, order, None] + distances[:, None] * offsets[:, None]
+    return at.reshape(3, -1), np.repeat(distances / math.sqrt(CLOSE_SIDES), CLOSE_SIDES)

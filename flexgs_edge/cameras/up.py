@@ -103,7 +103,7 @@ class Stands:
 
 def find_up(scene: Witnesses, stands: Stands) -> Up:
     """The direction of up: from the ground, the ring of cameras, or the convention."""
-    told = float(scene.tells.mean()) >= RING_TELLING
+    told = scene.share >= RING_TELLING
     ring = _ring(stands) if told else None
     ground = _ground(scene.sample, scene.whole.extent)
     if ground is not None and told and abs(float((stands.forward.mean(axis=1) * ground).sum())) > FRONTAL:

@@ -1,4 +1,4 @@
-"""A scene in small, for placing cameras: where its parts lie, a grid of matter, and a sample of rows to be seen.
+"""A scene in small, for placing cameras: where its parts lie, and some of its Gaussians, which are drawn.
 
 All positions are relative to the source's origin.
 """
@@ -7,22 +7,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from flexgs_edge.cameras.matter import Matter, spread_matter
+from flexgs_edge.cameras.detail import few_rows, smears
 from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
 
 SAMPLE_ROWS = 1 << 15
-"""Rows for parts, grid and ground."""
-WITNESSES = 1200
-"""Rows that judge candidates (the witnesses)."""
-BOX = (0.01, 0.99)
-"""Quantiles of the positions that the grid spans."""
+"""Rows for parts and ground."""
+READ_ROWS = 1 << 23
+"""Most rows that are compared with those around them. Of more, every k-th is."""
+CHUNK_ROWS = 1 << 18
+"""Rows that are read together."""
+DRAWN_ROWS = 1 << 15
+"""Rows that are drawn, about; see `drawn_rows`."""
+TELLING_ROWS = 1200
+"""Rows whose SH tell directions."""
 BOX_REACH = 20.0
-"""The grid ends at so many half sides of the box of the first part."""
+"""Beyond so many half sides of the box of the first part, nothing is told apart."""
 BULK = (0.05, 0.95)
 """Quantiles of the positions for the middle and the box of a part."""
 OWN_SIZE = 2.0
@@ -37,6 +41,8 @@ PRECISION = 1e-5
 """Smallest half side of a box over its distance from the origin: float32 positions have 7 digits."""
 SH_FLOOR = 0.01
 """Rows with a weaker view-dependent colour, on average, do not tell directions."""
+OPAQUE = 0.5
+"""Where all opacities are less, they are raised until the largest is this: faint scenes are to be seen, too."""
 
 
 class Gaussians(Protocol):
@@ -47,7 +53,7 @@ class Gaussians(Protocol):
     sh_degree: int
     origin: np.ndarray
 
-    def read(self, rows: np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
+    def read(self, rows: slice | np.ndarray, fields: Sequence[str]) -> dict[str, np.ndarray]:
         """Read some rows: {field: [width, n] f32}."""
 
 
@@ -70,95 +76,6 @@ class Part:
     def extent(self) -> float:
         """Half the diagonal of the box, scene units."""
         return float(np.sqrt((self.half * self.half).sum()))
-
-
-@dataclass(frozen=True)
-class Witnesses:
-    """A scene in small.
-
-    Attributes
-    ----------
-    parts : list of Part
-        Boxes that cameras may stand in and around. The first is that of the whole scene.
-    matter : Matter
-        Optical density on a grid.
-    sample : Splats
-        Every k-th row, at most SAMPLE_ROWS.
-    share : float
-        Rows of the scene that a witness stands for.
-    means : np.ndarray
-        [3, M] f64.
-    weights : np.ndarray
-        [M] f64, opacities.
-    sizes : np.ndarray
-        [M] f64, geometric mean of the two largest deviations.
-    faces : np.ndarray
-        [3, 3, M] f64, the splat's axes (columns), each times the two deviations across it.
-    skin : np.ndarray
-        [M] f64, what belongs to the witness' own surface, scene units.
-    sh : np.ndarray
-        [3, K, M] f64, coefficients of degrees 1 to 3 over their root mean square over all directions.
-    tells : np.ndarray
-        [M] bool, rows whose SH tell from where they were trained.
-    """
-
-    parts: list[Part]
-    matter: Matter
-    sample: Splats
-    share: float
-    means: np.ndarray
-    weights: np.ndarray
-    sizes: np.ndarray
-    faces: np.ndarray
-    skin: np.ndarray
-    sh: np.ndarray
-    tells: np.ndarray
-
-    @property
-    def whole(self) -> Part:
-        """The box of the whole scene."""
-        return self.parts[0]
-
-    def thinned(self, step: int) -> Witnesses:
-        """A copy with every `step`-th witness."""
-        part = slice(None, None, step)
-        return replace(
-            self,
-            share=self.share * self.weights.size / max(1, self.weights[part].size),
-            means=self.means[:, part],
-            weights=self.weights[part],
-            sizes=self.sizes[part],
-            faces=self.faces[:, :, part],
-            skin=self.skin[part],
-            sh=self.sh[:, :, part],
-            tells=self.tells[part],
-        )
-
-    def areas(self, lines: np.ndarray) -> np.ndarray:
-        """[P, M] f64, what each witness covers across `lines` ([3, P, M], unit vectors), in deviations squared."""
-        total = np.zeros(lines.shape[1:])
-        for axis in range(3):
-            x, y, z = self.faces[:, axis]
-            total += (lines[0] * x + lines[1] * y + lines[2] * z) ** 2
-        areas: np.ndarray = np.sqrt(total)
-        return areas
-
-    def transmittance(self, eyes: np.ndarray) -> np.ndarray:
-        """[P, M] f64, the share of light from each witness that reaches `eyes` ([3, P])."""
-        return self.matter.transmittance(eyes, self.means, self.skin)
-
-    def agreement(self, eye: np.ndarray) -> np.ndarray:
-        """[M] f64, view-dependent colour towards `eye` over its mean over all directions.
-
-        It is 1 for rows that do not tell directions.
-        """
-        if not self.tells.any():
-            return np.ones(self.weights.size)
-        lines = self.means - eye[:, None]
-        lines /= np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-300)
-        basis = sh_basis(lines, self.sh.shape[1])
-        strength = np.sqrt(np.square((self.sh * basis).sum(axis=1)).sum(axis=0))
-        return np.where(self.tells, np.minimum(strength, 3.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -186,44 +103,138 @@ class Splats:
     def read(source: Gaussians, rows: np.ndarray) -> Splats:
         """Read `rows` of a scene."""
         planes = source.read(rows, ["means", "opacity_logits", "log_scales", "quats"])
-        logits = np.clip(planes["opacity_logits"][0].astype(np.float64), -40, 40)
-        # Clipped well inside float64's exponents, so that squares and products stay finite.
-        deviations = np.exp(np.clip(planes["log_scales"].astype(np.float64), -40, 40))
-        opacity = 1 / (1 + np.exp(-logits))
+        opacity, deviations = _opacities(planes), np.exp(_logs(planes))
         return Splats(planes["means"].astype(np.float64), opacity, deviations, rotations(planes["quats"]))
 
     @property
     def sizes(self) -> np.ndarray:
         """[n] f64, geometric mean of the two largest deviations."""
-        ordered = np.sort(self.deviations, axis=0)
-        sizes: np.ndarray = np.sqrt(ordered[1] * ordered[2])
-        return sizes
+        return _sizes(self.deviations)
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """A scene in small.
+
+    Attributes
+    ----------
+    parts : list of Part
+        Boxes that cameras may stand in and around. The first is that of the whole scene.
+    sample : Splats
+        Every k-th row, at most SAMPLE_ROWS.
+    area : float
+        Cross-sections of all rows together, scene units squared.
+    unit : float
+        Scene units of one unit of `planes`.
+    planes : dict of np.ndarray
+        What is drawn, {field: [width, M] f32}, without view-dependent colour.
+    means : np.ndarray
+        [3, M] f64, where they are, scene units.
+    sizes : np.ndarray
+        [M] f64, geometric mean of the two largest deviations, before they grew to stand for others.
+    smear : np.ndarray
+        [M] f64, see `smears`.
+    stands : np.ndarray
+        [M] f64, for how many rows of the scene each stands.
+    telling : np.ndarray
+        [T] int64, those of them whose SH tell from where they were trained.
+    sh : np.ndarray
+        [3, K, T] f64, coefficients of degrees 1 to 3 over their root mean square over all directions.
+    share : float
+        Share of the rows that tell directions.
+    """
+
+    parts: list[Part]
+    sample: Splats
+    area: float
+    unit: float
+    planes: dict[str, np.ndarray]
+    means: np.ndarray
+    sizes: np.ndarray
+    smear: np.ndarray
+    stands: np.ndarray
+    telling: np.ndarray
+    sh: np.ndarray
+    share: float
+
+    @property
+    def whole(self) -> Part:
+        """The box of the whole scene."""
+        return self.parts[0]
+
+    def agreement(self, eye: np.ndarray) -> np.ndarray:
+        """[T] f64, view-dependent colour of the telling rows towards `eye` over its mean over all directions."""
+        lines = self.means[:, self.telling] - eye[:, None]
+        lines /= np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-300)
+        basis = sh_basis(lines, self.sh.shape[1])
+        strength: np.ndarray = np.minimum(np.sqrt(np.square((self.sh * basis).sum(axis=1)).sum(axis=0)), 3.0)
+        return strength
 
 
 def gather_witnesses(source: Gaussians) -> Witnesses:
-    """Read a sample of a scene: every k-th row. Any scene with at least one Gaussian will do."""
-    rows = np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS)))
-    sample = Splats.read(source, rows)
-    sizes = sample.sizes
-    parts = find_parts(sample.means, sizes, sample.opacity)
-    near = _nearest_half(sample.means, sample.opacity, parts[0].middle)
-    core = part_of(sample.means[:, near], sizes[near], sample.opacity[near])
-    matter = spread_matter(
-        sample.means,
-        sample.turns * sample.deviations,
-        sample.opacity * (source.count / rows.size),
-        _grid_box(sample, parts[0]),
-        (core.middle, core.extent),
-    )
-    picked = np.arange(0, rows.size, max(1, -(-rows.size // WITNESSES)))
-    sh, tells = _directions(source, rows[picked])
-    means = sample.means[:, picked]
-    a, b, c = sample.deviations[:, picked]
-    faces = sample.turns[:, :, picked] * np.stack([b * c, a * c, a * b])
+    """Look through a scene. Any with at least one Gaussian will do."""
+    sample = Splats.read(source, np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS))))
+    parts = find_parts(sample.means, sample.sizes, sample.opacity)
+    step = max(1, -(-source.count // READ_ROWS))
+    columns = []
+    for start in range(0, source.count, step * CHUNK_ROWS):
+        rows = slice(start, min(start + step * CHUNK_ROWS, source.count))
+        planes = source.read(rows, ["means", "opacity_logits", "log_scales"])
+        planes = {name: plane[:, ::step] for name, plane in planes.items()}
+        columns.append((planes["means"], _sizes(np.exp(_logs(planes))), _opacities(planes)))
+    means, sizes, opacity = (np.concatenate(column, axis=-1) for column in zip(*columns))
+    reach = BOX_REACH * float(parts[0].half.max())
+    smear, place = smears(means, sizes, parts[0].middle - reach, 2 * reach)
+    areas = opacity * sizes * sizes
+    drawn, growth = few_rows(areas, DRAWN_ROWS)
+    # Views leave out blocks of rows that lie beside them.
+    order = np.argsort(place[drawn])
+    drawn, growth = drawn[order], growth[order]
+    unit = min(part.extent for part in parts)
+    planes = source.read(drawn * step, ["means", "opacity_logits", "log_scales", "quats"])
+    logs = _logs(planes) + np.log(growth * (math.sqrt(step) / unit))
+    peak = float(_opacities(planes).max())
+    raised = max(0.0, math.log(OPAQUE / (1 - OPAQUE)) - math.log(peak / max(1 - peak, 1e-300)))
+    logits = np.clip(planes["opacity_logits"], -60, 60) + raised
+    telling, sh, share = _directions(source, drawn * step)
     return Witnesses(
-        parts, matter, sample, source.count / picked.size,
-        means, sample.opacity[picked], sizes[picked], faces, matter.skin(means), sh, tells,
-    )  # fmt: skip
+        parts=parts,
+        sample=sample,
+        area=2 * step * float(np.rint(areas / max(float(areas.max()), 1e-300) * 2.0**24).sum() * areas.max() / 2.0**24),
+        unit=unit,
+        planes={
+            "means": np.clip(planes["means"] / unit, -1e9, 1e9).astype(np.float32),
+            "opacity_logits": logits.astype(np.float32),
+            "log_scales": np.clip(logs, -40, 20).astype(np.float32),
+            "quats": planes["quats"],
+            "sh_dc": np.zeros((3, drawn.size), np.float32),
+        },
+        means=means[:, drawn].astype(np.float64),
+        sizes=sizes[drawn],
+        smear=smear[drawn],
+        stands=step * growth * growth,
+        telling=telling,
+        sh=sh,
+        share=share,
+    )
+
+
+def _logs(planes: dict[str, np.ndarray]) -> np.ndarray:
+    # Clipped well inside float64's exponents, so that squares and products stay finite.
+    logs: np.ndarray = np.clip(planes["log_scales"].astype(np.float64), -40, 40)
+    return logs
+
+
+def _opacities(planes: dict[str, np.ndarray]) -> np.ndarray:
+    opacity: np.ndarray = 1 / (1 + np.exp(-np.clip(planes["opacity_logits"][0].astype(np.float64), -60, 40)))
+    return opacity
+
+
+def _sizes(deviations: np.ndarray) -> np.ndarray:
+    a, b, c = deviations
+    least = np.minimum(np.minimum(a, b), c)
+    sizes: np.ndarray = np.sqrt(a / least * b * c)
+    return sizes
 
 
 def find_parts(means: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> list[Part]:
@@ -271,13 +282,6 @@ def _nearest_half(means: np.ndarray, weights: np.ndarray, middle: np.ndarray) ->
     return near
 
 
-def _grid_box(sample: Splats, whole: Part) -> tuple[np.ndarray, np.ndarray]:
-    low, high = weighted_quantiles(sample.means, np.ones(sample.opacity.size), BOX)
-    low, high = np.minimum(low, whole.middle - whole.half), np.maximum(high, whole.middle + whole.half)
-    reach = BOX_REACH * float(whole.half.max())
-    return np.maximum(low, whole.middle - reach), np.minimum(high, whole.middle + reach)
-
-
 def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     """[len(shares), c], quantiles of each row of `values` ([c, n]) with `weights` ([n])."""
     order = np.argsort(values, axis=1, kind="stable")
@@ -304,15 +308,17 @@ def rotations(quats: np.ndarray) -> np.ndarray:
     )
 
 
-def _directions(source: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SH above degree 0 over their root mean square, and the rows that are strong enough to tell directions."""
+def _directions(source: Gaussians, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Which of some drawn rows tell directions, their SH above degree 0 over their root mean square, and their share."""
     used = min(source.sh_degree, 3)
     kept = (used + 1) ** 2 - 1
     if not kept:
-        return np.zeros((3, 0, rows.size)), np.zeros(rows.size, bool)
-    coefficients = source.read(rows, ["sh_rest"])["sh_rest"].astype(np.float64).reshape(3, -1, rows.size)[:, :kept]
-    strength = np.sqrt(np.square(coefficients).sum(axis=(0, 1)) / (4 * math.pi))
-    return coefficients / (strength + SH_FLOOR / 10), strength > SH_FLOOR
+        return np.zeros(0, np.int64), np.zeros((3, 0, 0)), 0.0
+    some = np.arange(0, drawn.size, max(1, -(-drawn.size // TELLING_ROWS)))
+    rest = source.read(drawn[some], ["sh_rest"])["sh_rest"].astype(np.float64).reshape(3, -1, some.size)[:, :kept]
+    strength = np.sqrt(np.square(rest).sum(axis=(0, 1)) / (4 * math.pi))
+    told = strength > SH_FLOOR
+    return some[told], (rest / (strength + SH_FLOOR / 10))[:, :, told], float(told.mean())
 
 
 def sh_basis(directions: np.ndarray, count: int) -> np.ndarray:

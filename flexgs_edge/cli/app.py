@@ -28,6 +28,7 @@ COMMANDS = {
     "verify": "Check every byte of a .fgs file against its checksums.",
     "view": "Look at a scene in the browser.",
     "render": "Draw views of a scene as PNG files.",
+    "views": "Draw all views of a scene on one sheet.",
     "evaluate": "Compare a scene with its original, view by view.",
     "score": "Save the importance of every Gaussian, for --method paper.",
     "study": "Run experiments on your own scenes: tables and charts.",

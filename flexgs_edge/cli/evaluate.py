@@ -32,7 +32,7 @@ def command(
     input: str,
     against: str,
     lpips: bool,
-    base_psnr: float,
+    base_psnr: float | None,
     report: str | None,
     force: bool,
     json_path: str | None,

@@ -92,6 +92,12 @@ def _result(run: Run[CompressOptions], context: RenderContext | None, made: Meth
     warnings = view_warnings(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
     reached = search.reached if search and options.fixed is None else None
     warnings += _default_warnings(run, reached, search)
+    had = scene_info(run.scene).bytes
+    if had is not None and made.size > had and not options.dry_run:
+        warnings += (
+            f"The result has {made.size} bytes, the input {had}: keep the input, or ask for less (--max-size, --max-drop, "
+            "--min-fidelity).",
+        )
     promise = kept_promise(plan.target, made.size, search.chosen.measurement) if search else None
     for warning in warnings:
         LOG.warning("warning: %s", warning)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.lpips import Lpips
@@ -28,7 +27,7 @@ def evaluate(
     input: str | Path,  # the scene to measure: a file or a model folder
     against: str | Path,
     options: ViewOptions | None = None,
-    base_psnr: float = DEFAULT_BASE_PSNR,  # assumed PSNR of the original against its photos, for the modelled drop, dB
+    base_psnr: float | None = None,  # assumed PSNR of the original against its photos, for the modelled drop, dB
     progress: Progress = SILENT,  # shows a bar
     report: str | Path | None = None,
     force: bool = False,  # overwrite an earlier report
@@ -43,7 +42,7 @@ def evaluate(
     times and memory.
     """
     options = replace(options or ViewOptions(), **words)
-    if not 0.0 < base_psnr < 200.0:
+    if base_psnr is not None and not 0.0 < base_psnr < 200.0:
         raise InputError(f"--base-psnr {base_psnr:g}: expected decibels between 0 and 200")
     reporter = Reporter.maybe(report, force)
     # Draw both scenes alike: a compressed scene stores how its original is drawn.

@@ -33,6 +33,8 @@ class MemoryBudget:
     """Functions that each free a whole scene on the device. The scene is loaded again when it is drawn next."""
     foreseen: Callable[[], int] | None = None
     """Reckons a limit that is expected to be enough for all stages. Only an error calls it, and names that limit."""
+    runtime: int = 0
+    """Bytes taken for a device's runtime. It stays loaded when the device is closed, and is counted once."""
     heap: HeapWatch | None = field(default_factory=HeapWatch)
     """Keeps freed memory from counting against the limit; None where pages of scratch files may lie above the limit."""
 

@@ -30,6 +30,11 @@ FIT_PIXELS = 1 << 16
 LEAST_GAIN = 0.5
 """A fit counts if it lowers the error by this much, dB. Without a smaller one, a drop of 1 dB reads as .9 dB or more."""
 
+MOVED = 0.0017
+"""By this angle pictures are moved to tell how far photos may be from them, radians: a tenth of a degree."""
+LONE_BASES = 28.0, 36.0
+"""Least and largest base without photos, dB: those of usual models."""
+
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
     """Mean squared error of two [H, W, 3] images clamped to [0, 1], summed in float64."""
@@ -117,6 +122,40 @@ def fidelity_for_drop(decibel: float, base_psnr: float = DEFAULT_BASE_PSNR) -> f
     """
     error = error_for_drop(decibel, base_psnr)
     return psnr(error) if error > 0.0 else None
+
+
+def moved_error(image: np.ndarray, focal: float) -> float:
+    """Mean squared error of an [H, W, 3] image against itself, moved right or down by the angle `MOVED`.
+
+    `focal`: Focal length, pixels.
+    """
+    step = max(1, round(MOVED * focal))
+    height, width, _ = image.shape
+    if min(height, width) <= step:
+        return 0.0
+    error = (mse(image[:, step:], image[:, :-step]) + mse(image[step:], image[:-step])) / 2
+    return error * min(MOVED * focal / step, 1.0) ** 2
+
+
+def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
+    """Assumed PSNR of an original against photos that are not there, dB.
+
+    Pictures with much detail are farther from their photos than those with little, about as far as from themselves when they
+    are moved by a tenth of a degree: docs/results/tuning.md#default_base_psnr
+
+    Parameters
+    ----------
+    errors : sequence of float
+        `moved_error` of the original's render in each view.
+    coverages : sequence of float
+        Share of each view that the original covers, which alone counts.
+
+    >>> lone_base([1e-3, 5e-4], [1.0, 0.5]), lone_base([0.0], [1.0])
+    (30.0, 36.0)
+    """
+    error = math.fsum(errors) / (math.fsum(coverages) or 1.0)
+    low, high = LONE_BASES
+    return round(min(max(-10.0 * math.log10(max(error, MSE_FLOOR)), low), high), 1)
 
 
 def contrast(image: np.ndarray) -> float:

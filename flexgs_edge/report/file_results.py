@@ -125,7 +125,8 @@ class RenderResult:
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         first = self.files[0] if self.files else "no files"
         last = f" ... {self.files[-1]}" if len(self.files) > 1 else ""
-        lines.append(line("wrote", f"{len(self.files)} PNG files: {first}{last}"))
+        many = f"{len(self.files)} PNG files: " if len(self.files) != 1 else ""
+        lines.append(line("wrote", f"{many}{first}{last}"))
         lines.append(
             line(
                 "time",

@@ -68,7 +68,7 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
         line(
             "fidelity",
             f"{decibel(quality.fidelity)}{unit} against the original's renders{identical}{also}; modelled drop "
-            f"{quality.modelled_drop:.3f} dB from a base of {quality.base_psnr:g} dB (mean, {where})",
+            f"{quality.modelled_drop:.3f} dB if the photos are {quality.base_psnr:g} dB from the original (mean, {where})",
         )
     )
     lines.append(line("covered", covered_words(quality)))

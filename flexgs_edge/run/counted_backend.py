@@ -20,7 +20,8 @@ def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) 
     before = current_rss()
     with clock.stage("device"):
         backend = open_backend(device, budget)
-    if not backend.is_numpy:
+    if not backend.is_numpy and not budget.runtime:
         # The runtime and its compiler stay loaded. They take more memory when no kernels are cached.
-        budget.take("the OpenCL runtime", max(current_rss() - before, 0) + BUILD_BYTES)
+        budget.runtime = max(current_rss() - before, 0) + BUILD_BYTES
+        budget.take("the OpenCL runtime", budget.runtime)
     return backend

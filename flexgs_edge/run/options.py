@@ -145,7 +145,7 @@ class CompressOptions(ViewOptions):
     sh_rate: float | None = None
     bits: str = "paper"
     groups: int | None = None
-    base_psnr: float = DEFAULT_BASE_PSNR
+    base_psnr: float | None = None
     trust_views: bool = False
     effort: str = "balanced"
     best_effort: bool = False
@@ -176,7 +176,7 @@ class CompressOptions(ViewOptions):
         ):
             if value not in known:
                 raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
-        if not 0.0 < self.base_psnr < 200.0:
+        if self.base_psnr is not None and not 0.0 < self.base_psnr < 200.0:
             raise InputError(
                 f"--base-psnr {self.base_psnr:g}: expected decibels between 0 and 200 (most scenes: 22 to 36)"
             )
@@ -274,7 +274,7 @@ class CompressOptions(ViewOptions):
             target = min_ratio(self.min_ratio, ply_bytes, figure)
         elif self.min_fidelity is not None:
             target = MinFidelity(self.min_fidelity)
-            allowed = modelled_drop(mse_of_psnr(self.min_fidelity), self.base_psnr)
+            allowed = modelled_drop(mse_of_psnr(self.min_fidelity), self.base_psnr or DEFAULT_BASE_PSNR)
         else:
             allowed = DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop
             target = MaxDrop(allowed, figure)

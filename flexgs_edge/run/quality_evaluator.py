@@ -15,7 +15,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
-from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, mse, with_gains
+from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, lone_base, moved_error, mse, with_gains
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
@@ -59,7 +59,8 @@ class QualityEvaluator:
         views: ViewSet,  # all views of the run
         indices: Sequence[int],  # the views to compare
         with_photos: bool = True,
-        base_psnr: float = DEFAULT_BASE_PSNR,  # PSNR of the original that the modelled drop starts from, dB
+        # Default: without photos what the original's renders tell (`lone_base`), else `DEFAULT_BASE_PSNR`, dB.
+        base_psnr: float | None = None,
         reports: bool = False,
     ) -> None:
         self.context, self.renderer = context, context.renderer
@@ -70,7 +71,8 @@ class QualityEvaluator:
         self._fits_exposure = views.fits_exposure
         self.covered_decides = views.photos is None
         self._automatic = views.cameras_from == AUTO_CAMERAS
-        self.base_psnr = base_psnr
+        self.base_psnr = DEFAULT_BASE_PSNR if base_psnr is None else base_psnr
+        self._given_base = base_psnr
         self.reports = reports
         self.indices = list(indices)
         self._budget = budget
@@ -103,6 +105,7 @@ class QualityEvaluator:
         """
         self._original_error, self._original_ssim, self._coverage, self._gains = [], {}, [], []
         contrasts: list[float] = []
+        moved: list[float] = []
         self._coarse_error, self._known = {}, {}
         cameras = progress.track(self.renderer.in_turn(scene, self.cameras), "drawing the original", len(self.cameras))
         for i, camera in enumerate(cameras):
@@ -110,12 +113,16 @@ class QualityEvaluator:
             image = _planes(self.renderer.render(scene, camera))
             self._coverage.append(self.renderer.drawn_coverage())
             self._keep(("original", i), image)
-            if self.photos is not None:
+            if self.photos is None:
+                moved.append(moved_error(image, camera.fx))
+            else:
                 photo, gains = self._fitted(i, image)
                 self._gains.append(gains)
                 contrasts.append(contrast(photo))
                 self._original_error.append(mse(image, photo))
                 self._keep(("photo", i), photo)
+        if self.photos is None and self._given_base is None:
+            self.base_psnr = lone_base(moved, self._coverage)
         self._far_bases = far_bases(self._original_error, contrasts, self.base_psnr)
         if not any(self._coverage):
             raise self._nothing_seen()

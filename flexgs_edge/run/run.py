@@ -108,7 +108,7 @@ def open_run(
                 budget.hold(each.held_bytes)
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
-        views = find_views(options, companions, scene.source, photos, given)
+        views = find_views(options, companions, scene.source, photos, given, budget)
         if asked is None and views is not None:
             options, views = near_enough(options, views)
         if reporter is not None and views is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,20 @@ from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, split_views
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
+from flexgs_edge.cameras.witnesses import READ_ROWS
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
+from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.run_info import ViewsInfo
+from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.run.counted_backend import counted_backend
 from flexgs_edge.run.inputs import LOG, Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.sketch import sketch
 
 MEMORY = "memory"  # Takes the place of a path in records when cameras or photos came from memory
+PLACING_BYTES = 90  # Bytes a row that are held while Gaussians are compared with those around them
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
 
 
@@ -75,6 +82,7 @@ def find_views(
     source: SceneSource,  # the scene, from which automatic cameras are placed
     with_photos: bool = True,  # Also open the photos. Default: yes.
     given: GivenViews | None = None,  # Cameras and photos from memory. They go before options and files.
+    budget: MemoryBudget | None = None,  # Pays for what placing automatic cameras needs. Default: one of the options.
 ) -> ViewSet | None:
     """Find the views of a run: from memory, from the options, beside the scene, or else generated.
 
@@ -98,7 +106,7 @@ def find_views(
                 f"{words}: photos need the cameras that took them: give --cameras PATH "
                 "(INRIA's cameras.json, a transforms.json or a COLMAP model)"
             )
-        return None if place == NO_CAMERAS else _automatic_views(options, source)
+        return None if place == NO_CAMERAS else _automatic_views(options, source, budget)
     else:
         cameras = read_cameras(place, options.ignore_distortion, options.dataparser or companions.dataparser)
     arrays = given.images if with_photos else None
@@ -126,9 +134,18 @@ def find_views(
     return ViewSet(list(cameras), photos, train, held_out, os.fspath(place), images, notes, fits_exposure=fits)
 
 
-def _automatic_views(options: ViewOptions, source: SceneSource) -> ViewSet:
-    LOG.info("generating camera views from the scene itself")
-    rig = automatic_rig(source, up=None if options.up is None else np.array(options.up))
+def _automatic_views(options: ViewOptions, source: SceneSource, budget: MemoryBudget | None) -> ViewSet:
+    LOG.info("placing camera views where the scene looks sharp")
+    budget = budget or MemoryBudget.from_limit(options.memory_limit)
+    up = None if options.up is None else np.array(options.up)
+    backend = counted_backend(options.device, budget, Stopwatch())
+    reading = PLACING_BYTES * min(source.count, READ_ROWS)
+    try:
+        budget.take("placing views", reading)
+        rig = automatic_rig(source, partial(sketch, backend, budget), up=up)
+        budget.give(reading)
+    finally:
+        backend.close()
     cameras, note = limit_width(rig.cameras, options.resolution)
     notes = (rig.note,) if note is None else (rig.note, note)
     train, held_out = split_views(len(cameras), options.holdout)

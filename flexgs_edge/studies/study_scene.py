@@ -107,7 +107,7 @@ class StudyScene:
         if self.plan.figure == "drop":
             return f"drop in PSNR against the photos, mean over {views}"
         return (
-            f"modelled drop (no photos: error against the original's renders, from a base of {self.run.options.base_psnr:g} dB), "
+            f"modelled drop (no photos: error against the original's renders, from a base of {self.judge.base_psnr:g} dB), "
             f"over {views}"
         )
 
@@ -167,7 +167,7 @@ class StudyScene:
 
     def error(self, point: Point) -> float:
         """Mean squared error against the original's renders, averaged over the views."""
-        return error_for_drop(point.measurement.modelled_drop, self.run.options.base_psnr)
+        return error_for_drop(point.measurement.modelled_drop, self.judge.base_psnr)
 
 
 FIGURES = {

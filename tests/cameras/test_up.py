@@ -13,6 +13,7 @@ from flexgs_edge.cameras.witnesses import gather_witnesses, sh_basis
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from kernel_fixtures import drawing
 from synthetic import joined, make_splats
 
 AXES = {"-y": (0, -1, 0), "+y": (0, 1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1), "+x": (1, 0, 0), "-x": (-1, 0, 0)}
@@ -102,7 +103,7 @@ def seen_from_a_ring(up: tuple[float, float, float]) -> MemorySource:
 
 def up_of(source: MemorySource) -> tuple[np.ndarray, str]:
     """What the top of the images points to on the whole, and the end of the note."""
-    rig = automatic_rig(source, 16, 64, 48)
+    rig = automatic_rig(source, drawing(), 16, 64, 48)
     assert rig.cameras[0].width == 64
     rights = np.array([camera.rotation[0] for camera in rig.cameras])
     # Level horizons: every right vector is across up.
@@ -176,12 +177,12 @@ def test_a_wall_that_all_views_face_is_no_ground() -> None:
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0.2), (1e200, 0, 0)])
 def test_a_given_up_overrides_all(up: tuple[float, float, float]) -> None:
-    rig = automatic_rig(table(), 8, 64, 48, np.array(up, float))
+    rig = automatic_rig(table(), drawing(), 8, 64, 48, np.array(up, float))
     assert rig.note.endswith("(--up)")
     for camera in rig.cameras:
         assert abs(camera.rotation[0] @ np.array(up, float)) < 1e-9 * max(up)
 
 
 def test_the_sample_is_z_up(sample_dir: object) -> None:
-    rig = automatic_rig(PlySource(f"{sample_dir}/point_cloud.ply"), 8)
+    rig = automatic_rig(PlySource(f"{sample_dir}/point_cloud.ply"), drawing(), 8)
     assert "up is +z (ground" in rig.note

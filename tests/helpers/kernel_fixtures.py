@@ -6,11 +6,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
+from flexgs_edge.cameras.auto import Drawing
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend, TwinBackend
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
@@ -20,6 +21,7 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.views.sketch import sketch
 
 FORMS = ("w16", "w8", "w4", "w1", "gpu", "gpu4")
 """Forms of the OpenCL kernels: vector widths of the CPU form; the GPU form, and that with four pixels a work-item."""
@@ -45,6 +47,11 @@ def open_form(form: str) -> Backend:
         return TwinBackend(large_budget())
     chosen = GPU_FORMS.get(form) or Form("cpu", int(form[1:]))
     return OpenCLBackend(replace(default_device(), form=str(chosen)), large_budget())
+
+
+def drawing(form: str = "w16") -> Drawing:
+    """What draws candidates for automatic views."""
+    return partial(sketch, open_form(form), large_budget())
 
 
 def draw(

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.commands.views import LABEL, WIDTH, draw_sheet
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.quality.psnr import LONE_BASES, MOVED, lone_base, moved_error
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import GivenViews
@@ -49,6 +51,32 @@ def test_up_turns_automatic_views(lone: Path) -> None:
     assert "up is +x (--up)" in run.seen.notes[0]
     assert all(abs(camera.rotation[0, 0]) < 1e-12 for camera in run.seen.cameras)
     assert "up is -y (convention)" in open_run(lone, ViewOptions()).seen.notes[0]
+
+
+def test_a_sheet_shows_all_views(tmp_path: Path, lone: Path) -> None:
+    from PIL import Image
+
+    result = draw_sheet(lone, tmp_path / "sheet.png")
+    assert result.views.total == len(result.view_seconds) >= 40
+    picture = np.asarray(Image.open(tmp_path / "sheet.png"))
+    across, down = picture.shape[1] // WIDTH, picture.shape[0] // (LABEL + WIDTH * 3 // 4)
+    assert across * down >= result.views.total > across * (down - 1) and across > down
+    # Every view has a name and shows something.
+    first = picture[:LABEL, :WIDTH], picture[LABEL : LABEL + 240, :WIDTH]
+    assert first[0].max() > 200 and first[1].std() > 5
+    with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
+        draw_sheet(lone, tmp_path / "sheet")
+
+
+def test_the_base_follows_from_the_detail_of_the_pictures() -> None:
+    rng = np.random.default_rng(0)
+    flat, rough = np.full((60, 80, 3), 0.5, np.float32), rng.uniform(0, 1, (60, 80, 3)).astype(np.float32)
+    ramp = np.broadcast_to(np.linspace(0, 1, 80, dtype=np.float32)[None, :, None], (60, 80, 3))
+    assert moved_error(flat, 500.0) == 0 and moved_error(rough, 500.0) > 0.1
+    # A ramp that is moved by a pixel changes by 1 / 79, in one of the two directions.
+    assert moved_error(ramp, 1 / MOVED) == pytest.approx(0.5 / 79**2, rel=1e-3)
+    assert moved_error(ramp, 0.5 / MOVED) == pytest.approx(0.125 / 79**2, rel=1e-3)
+    assert lone_base([0.0], [1.0]) == LONE_BASES[1] and lone_base([1.0], [1.0]) == LONE_BASES[0]
 
 
 @pytest.mark.parametrize(

@@ -260,7 +260,9 @@ def scored_poses(
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
-    most = plan.views if fine else plan.poses_of([camera.width * camera.height for camera in ordered], source.count)
+    # Without photos, poses are chosen for what they add: all are needed.
+    pixels = [camera.width * camera.height for camera in ordered]
+    most = plan.views if fine or covered_decides else plan.poses_of(pixels, source.count)
     chosen, given = ordered[:most], {id(camera) for camera in cameras}
     if options.makes_poses:
         scored = [*chosen, *margin_of(renderer, source, chosen, cameras)]
@@ -270,7 +272,9 @@ def scored_poses(
     errors = None
     if photo is not None:
         drop = options.max_drop or DEFAULT_MAX_DROP
-        errors = KnownErrors(deciding, base_errors(renderer, source, deciding, photo, options.base_psnr), drop)
+        errors = KnownErrors(
+            deciding, base_errors(renderer, source, deciding, photo, options.base_psnr or DEFAULT_BASE_PSNR), drop
+        )
     if not fine:
         steps = sampling_steps(chosen, source.count * plan.pixels)
         if errors is not None:

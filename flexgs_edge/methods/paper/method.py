@@ -59,7 +59,7 @@ def bits_by_sensitivity(
             return judge.compare(scene).deciding_error
 
     kept, with_sh = evaluator.counts(EVERYTHING)
-    bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, base_psnr))
+    bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, judge.base_psnr))
     judge.close()
     LOG.info("bits found by sensitivity: %s", bits)
     return bits, found

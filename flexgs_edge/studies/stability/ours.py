@@ -50,14 +50,14 @@ def view_loss(studied: StudyScene, view: ViewQuality) -> float:
     if studied.plan.figure == "drop" and view.loss is not None:
         return view.loss
     error = view.covered_error or 0.0 if studied.judge.covered_decides else view.error
-    return modelled_drop(error, studied.run.options.base_psnr)
+    return modelled_drop(error, studied.judge.base_psnr)
 
 
 def mean_loss(studied: StudyScene, views: Sequence[ViewQuality]) -> float:
     """Mean loss of some views in the figure that decides, dB."""
     if studied.plan.figure == "drop":
         return math.fsum(view_loss(studied, view) for view in views) / len(views)
-    base_psnr = studied.run.options.base_psnr
+    base_psnr = studied.judge.base_psnr
     return modelled_drop(Quality(tuple(views), covered_decides=studied.judge.covered_decides).deciding_error, base_psnr)
 
 

@@ -1,0 +1,361 @@
+"""Candidates for automatic views: what each shows, what it is worth, and which of them are needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.detail import UNITS as LOGS
+from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
+from flexgs_edge.cameras.witnesses import Witnesses
+from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
+
+MOST_VIEWS = 400
+SHOWN = 0.98
+"""Views are enough when they show this share of all Gaussians that good views show, all together as well as the best of these."""
+SIDE = 80
+"""Pixels along the side of a candidate's picture, a square of the same area as the view."""
+LEAST_ANGLE = 0.002
+"""A Gaussian is shown well if its deviation is this, radians: a pixel of a view 640 wide."""
+LOOKED_AT = 40.0, 20.0, 10.0
+"""Distances of the places around one that is not, in its deviations."""
+LINES = 3
+"""Most directions of view from a place."""
+TURNED = math.cos(math.radians(40.0))
+"""Directions of view from one place differ by more than this."""
+SMEAR, SMEAR_FREE = 0.03, 0.1
+"""Views count e times less for each step by which Gaussians are wider than those around them, in the mean of logs, beyond what
+the sharpest tenth shows and what is free. Real cameras' views lie within .1 of each other, those from behind and from below .2
+beyond."""
+BLURRED_TIMES = 2.0
+"""What is free for the width of splats in the view, a factor."""
+LEAST_SHARP, LEAST_WORTH = 0.1, 1e-4
+"""Views that count less than this for what is too wide in them, or in all, are not taken at all."""
+GOOD = 0.1
+"""Views are enough when they show what views show that are worth this share of the best, or more."""
+DECIDING = 0.3
+"""Views that are worth less than this share of the best do not decide."""
+NEW, LEAST_NEW, NEW_SHARP = 0.5, 0.001, 0.3
+"""Views that show at least the second share of the Gaussians, which all others together show less than the first, are taken
+however little they are worth, if they count so much for what is too wide in them."""
+BLURRED = 0.15
+"""Usual deviation of a view's splats, radians, beyond which it shows a blur: matter right before the lens or all around it."""
+NEAR, NEAR_POWER = 0.3, 8
+"""Light is from right before the lens if it comes from less than this share of the view's usual distance, from splats wider
+than WIDE. Views count by this power of the share of all other light."""
+WIDE = 0.1
+ENCLOSED_POWER = 1
+"""Places with matter on more than half of all sides count by this power of it: inside a room, not behind its walls."""
+SHARP = 0.008
+"""Usual deviation of a splat over its distance from a camera (4 pixels in a view 640 wide)."""
+SHARP_SPREAD = math.log(8.0)
+"""One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same
+distance."""
+AGREEMENT_POWER = 2
+APART = 0.1
+"""Views nearer to each other than this share of the distance of what they show add less."""
+FILLED, FILLED_POWER = 0.3, 2
+"""Views that matter fills less than this, or less than the usual good one, count by this power of how much less."""
+FARTHEST = 1e9
+"""Candidates farther away, in extents of the smallest part, are left out: float32 must hold them."""
+UNITS = 2.0**20
+"""Merits and wants are whole numbers up to this. The sum of their products is exact in float64."""
+
+Show = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
+"""Draws a view: the rows that it shows ([m] int64), and the sum of alpha T over the pixels for each ([m] f64)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A candidate and what its picture shows.
+
+    Attributes
+    ----------
+    at, line : np.ndarray
+        [3] f64, where it is, relative to the scene's origin, and where it looks.
+    step : float
+        Distance to other candidates, scene units.
+    sides : float
+        Share of all directions in which there is matter, about.
+    rows : np.ndarray
+        [m] int64, what it shows.
+    part : np.ndarray
+        [m] f64, how much of each, scene units squared.
+    close : np.ndarray
+        [m] f64, 0 to 1, how well their sizes in the view suit it.
+    clear, smear, blur, filled, distance : float
+        What its worth follows from; the usual distance of what it shows, scene units.
+    """
+
+    at: np.ndarray
+    line: np.ndarray
+    step: float
+    sides: float
+    rows: np.ndarray
+    part: np.ndarray
+    close: np.ndarray
+    clear: float
+    smear: float
+    blur: float
+    filled: float
+    distance: float
+
+
+class Stage:
+    """Candidates with all that is known of them."""
+
+    def __init__(self, scene: Witnesses, show: Show, frames: Frames, lens: float) -> None:
+        self.scene, self.frames = scene, frames
+        self._show, self._focal = show, SIDE * lens
+        self.views: list[Candidate] = []
+        self._most = np.zeros(scene.sizes.size)
+        """The largest part of each Gaussian that any view shows, scene units squared."""
+        self.seldom = 0.0
+        """Share of the Gaussians that no good view shows."""
+
+    def add_place(self, eye: np.ndarray, step: float) -> None:
+        """Draw the views from a place ([3]) that should show most, if nothing hides it."""
+        scene, frames = self.scene, self.frames
+        lines, distance = _lines(scene.means, eye)
+        bins = bins_of(lines)
+        amounts = np.rint(UNITS * _close(scene.sizes / distance) * scene.stands / float(scene.stands.max()))
+        sums, sides = frames.sums(bins, amounts), filled_share(bins)
+        most = float(sums.max())
+        for _ in range(LINES):
+            best = int(np.argmax(sums))
+            if sums[best] <= 0.1 * most:
+                break
+            line = frames.directions[best]
+            if sides < 0.5:
+                line = _middle(lines, amounts * frames.holds(line, lines), line)
+            self._draw(eye, line, step, sides)
+            sums[_along(line, frames.directions.T) > TURNED] = 0
+
+    def add_beside(self, view: Candidate) -> None:
+        """Draw four views of the same: from two places beside, nearer and farther."""
+        target = view.at + view.line * view.distance
+        across = np.cross(view.line, np.eye(3)[int(np.argmin(np.abs(view.line)))])
+        across /= _length(across)
+        turn = 2.399963 * len(self.views)
+        aside = math.cos(turn) * across + math.sin(turn) * np.cross(view.line, across)
+        step = view.step / 2
+        for move in (aside * step, -aside * step, 0.3 * view.line * view.distance, -0.4 * view.line * view.distance):
+            eye = view.at + move
+            line = target - eye
+            self._draw(eye, line / max(_length(line), 1e-300), step, view.sides)
+
+    def add_missing(self, count: int) -> None:
+        """Draw views of `count` of the Gaussians that no view shows well, evenly spread over all of them."""
+        scene, best = self.scene, np.zeros(self.scene.sizes.size)
+        for view, worth in zip(self.views, self._worth() if self.views else ()):
+            if worth:
+                best[view.rows] = np.maximum(best[view.rows], view.close)
+        missing = np.flatnonzero(best < _close(np.array([LEAST_ANGLE]))[0])
+        directions = fibonacci(len(LOOKED_AT) * min(count, missing.size)).reshape(-1, len(LOOKED_AT), 3)
+        for place, lines in enumerate(directions):
+            row = missing[place * missing.size // len(directions)]
+            for line, times in zip(lines, LOOKED_AT):
+                distance = times * float(scene.sizes[row])
+                eye = scene.means[:, row] - line * distance
+                self._draw(eye, line, distance, filled_share(bins_of(_lines(scene.means, eye)[0])))
+
+    def _draw(self, eye: np.ndarray, line: np.ndarray, step: float, sides: float) -> None:
+        scene, half = self.scene, (SIDE - 1) / 2
+        if float(np.abs(eye).max()) > FARTHEST * scene.unit:
+            return
+        camera = look("small", eye / scene.unit, line, np.array([0.0, -1.0, 0.0]), SIDE, SIDE, self._focal)
+        rows, weights = self._show(replace(camera, cx=half, cy=half))
+        if not rows.size:
+            return
+        light = np.rint(weights * LOGS)
+        total = float(light.sum())
+        if not total:
+            return
+        _, distance = _lines(scene.means[:, rows], eye)
+        angles = scene.sizes[rows] / distance
+        logs, blurs = (np.rint(np.log(np.maximum(values, 1e-300)) * LOGS) for values in (distance, angles))
+        usual = float((light * logs).sum()) / total
+        before = float(light[(angles > WIDE) & (logs < usual + math.log(NEAR) * LOGS)].sum()) / total
+        blur = float((light * blurs).sum()) / total / LOGS
+        filled = min(total / LOGS / SIDE**2, 1.0)
+        # Pictures show splats wider than they are: tiny ones would seem large from far away.
+        pixels = (self._focal * angles) ** 2 * scene.stands[rows]
+        part = weights * np.minimum(distance, 1e100) ** 2 * (pixels / (pixels + DILATION))
+        np.maximum.at(self._most, rows, part)
+        clear = (1 - before) ** NEAR_POWER * math.exp(-min((math.exp(min(blur, 50.0)) / BLURRED) ** 2, 600.0))
+        clear *= min(filled / FILLED, 1.0) ** FILLED_POWER * max(0.5, sides) ** ENCLOSED_POWER
+        smear = float((light * scene.smear[rows]).sum()) / total / LOGS
+        self.views.append(
+            Candidate(
+                eye, line, step, sides, rows, part, _close(angles), clear * self._told(eye, rows, part), smear, blur, filled,
+                math.exp(usual / LOGS),
+            )
+        )  # fmt: skip
+
+    def _told(self, eye: np.ndarray, rows: np.ndarray, part: np.ndarray) -> float:
+        """How strong view-dependent colours are towards a place, over their mean over all directions; 1 without SH."""
+        scene = self.scene
+        if not scene.telling.size:
+            return 1.0
+        shown = np.zeros(scene.sizes.size)
+        shown[rows] = part
+        share = np.rint(UNITS * shown[scene.telling] / np.maximum(self._most[scene.telling], 1e-300))
+        if not share.any():
+            return 1.0
+        return float(np.rint(share * scene.agreement(eye) ** AGREEMENT_POWER).sum() / float(share.sum()))
+
+    def _worth(self) -> np.ndarray:
+        """[V] f64, what each view is worth, 0 to 1."""
+        clear, smear, blur, filled = (
+            np.array([getattr(view, name) for view in self.views]) for name in ("clear", "smear", "blur", "filled")
+        )
+        good = np.rint(UNITS * clear * filled / max(float((clear * filled).max()), 1e-300))
+        over = np.maximum(smear - _quantile(smear, good, 0.1) - SMEAR_FREE, 0.0)
+        in_place = np.exp(-np.minimum(over / SMEAR, 600.0)) >= NEW_SHARP
+        over += np.maximum(blur - _quantile(blur, good, 0.2) - math.log(BLURRED_TIMES), 0.0)
+        sharp = np.rint(UNITS * np.exp(-np.minimum(over / SMEAR, 600.0))) / UNITS
+        solid = np.minimum(filled / _quantile(filled, good, 0.5), 1.0) ** FILLED_POWER
+        self.last = in_place & (clear * solid >= LEAST_WORTH * float((clear * solid).max()))
+        """[V] bool, views that may be taken if nothing else shows what they show."""
+        worth = np.where(sharp >= LEAST_SHARP, clear * sharp * solid, 0.0)
+        worth = np.rint(UNITS * worth / max(float(worth.max()), 1e-300)) / UNITS
+        return np.where(worth >= LEAST_WORTH, worth, 0.0)
+
+    def choose(self, count: int | None, least: int = 0) -> list[Candidate]:
+        """So many views, or `least` ones and as many more as are needed. Each next one is the one that adds most."""
+        if not self.views:
+            return []
+        scene, worth = self.scene, self._worth()
+        self.worth = worth
+        merits = [
+            np.rint(1024 * view.part * view.close / np.maximum(self._most[view.rows], 1e-300)) for view in self.views
+        ]
+        shows = [float((merit * np.rint(scene.stands[view.rows])).sum()) for merit, view in zip(merits, self.views)]
+        self.strength = worth * np.array(shows)
+        fullest, seldom = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
+        for view, merit, each, last in zip(self.views, merits, worth, self.last):
+            if each or last:
+                most = fullest if each >= GOOD else seldom
+                most[view.rows] = np.maximum(most[view.rows], merit)
+        stands = np.rint(16 * scene.stands)
+        needed = stands * (fullest > 0)
+        self.seldom = 1 - float(needed.sum()) / max(float(stands.sum()), 1.0)
+        fullest = np.where(fullest > 0, fullest, seldom)
+        stands *= fullest > 0
+        fullest = np.maximum(fullest, 1.0)
+        # A Gaussian counts with the root of what the best view shows of it: rare and faint ones are to be seen too.
+        # One that stands for many counts with their root: dense textures are not all there is to see.
+        root = np.rint(16 * np.sqrt(scene.stands) * (needed > 0) * np.sqrt(1024 / fullest))
+        shown = np.zeros(fullest.size)
+        room = np.ones(len(self.views))
+        # The gain of a view only falls, so an older gain is an upper bound. Few views are looked at again for each one.
+        bounds = np.where(worth > 0, np.inf, 0.0)
+        chosen: list[Candidate] = []
+        at = np.array([view.at for view in self.views]).T
+        distances = np.array([view.distance for view in self.views])
+        new_only = False
+        while len(chosen) < (count or MOST_VIEWS) and bounds.any():
+            enough = float(needed[shown >= 1].sum()) >= SHOWN * float(needed.sum())
+            if count is None and not new_only and len(chosen) >= least and enough:
+                new_only, bounds = True, np.where(self.last, np.inf, 0.0)
+            wanted = stands * (shown < NEW) if new_only else np.rint(root / (1 + shown))
+            fresh = np.zeros(len(self.views), bool)
+            while not fresh[best := int(np.argmax(bounds))]:
+                view = self.views[best]
+                if new_only:
+                    bounds[best] = float(wanted[view.rows][merits[best] >= NEW * fullest[view.rows]].sum())
+                else:
+                    bounds[best] = float((merits[best] * wanted[view.rows]).sum()) * worth[best] * room[best]
+                fresh[best] = True
+            if new_only and bounds[best] < LEAST_NEW * float(stands.sum()):
+                break
+            view = self.views[best]
+            chosen.append(view)
+            shown[view.rows] += merits[best] / fullest[view.rows]
+            away, turned = at - view.at[:, None], np.array([_along(view.line, other.line) for other in self.views])
+            apart = (away * away).sum(axis=0) / np.maximum(APART * distances, 1e-300) ** 2
+            apart += np.maximum(1 - turned, 0.0) * 8
+            room *= np.rint(UNITS * (1 - 0.7 * np.exp(-0.5 * np.minimum(apart, 1000.0)))) / UNITS
+            room[best] = bounds[best] = 0.0
+        self._worths = {id(view): float(each) for view, each in zip(self.views, worth)}
+        self._shares = {id(view): merits[self.views.index(view)] / fullest[view.rows] for view in chosen}
+        return chosen
+
+    def in_order(self, chosen: list[Candidate]) -> list[Candidate]:
+        """The chosen views in an order in which every `DEFAULT_HOLDOUT`-th one, from the first, lies between others.
+
+        These are evenly spread over the half whose Gaussians the others show most, without views that are worth little.
+        """
+        if not chosen:
+            return []
+        shares, total = self._shares, np.zeros(self.scene.sizes.size)
+        for view in chosen:
+            total[view.rows] += shares[id(view)]
+        alone = []
+        for view in chosen:
+            share = np.rint(UNITS * shares[id(view)]) * np.rint(16 * self.scene.stands[view.rows])
+            others = 1 / (1 + total[view.rows] - shares[id(view)])
+            alone.append(float(np.rint(share * others).sum()) / max(float(share.sum()), 1.0))
+        count = len(chosen)
+        held = -(-count // DEFAULT_HOLDOUT)
+        rank = np.array(alone) + [2.0 * (self._worths[id(view)] < DECIDING) for view in chosen]
+        among = np.argsort(rank, kind="stable")[: max(held, count // 2)]
+        between = [int(among[turn * among.size // held]) for turn in range(held)]
+        last, first = iter(between), iter([turn for turn in range(count) if turn not in between])
+        return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(count)]
+
+
+def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors ([3, n]) and distances ([n]) from `eye` ([3]) to `means` ([3, n])."""
+    lines = means - eye[:, None]
+    distance = np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-200)
+    return lines / distance, distance
+
+
+def _close(angles: np.ndarray) -> np.ndarray:
+    """[n] f64, 0 to 1, how well deviations over distances suit a view."""
+    off = (np.log(np.maximum(angles, 1e-300)) - math.log(SHARP)) / SHARP_SPREAD
+    found: np.ndarray = np.exp(-0.5 * np.minimum(off * off, 1000.0))
+    return found
+
+
+def _middle(lines: np.ndarray, amounts: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Mean direction of `lines` ([3, n]) with `amounts`; `line` where they have none."""
+    middle = (np.rint(lines * UNITS) * amounts).sum(axis=1)
+    length = _length(middle)
+    return middle / length if length > 0 else line
+
+
+def _along(line: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Cosines between a direction ([3]) and others ([3, ...])."""
+    found: np.ndarray = line[0] * lines[0] + line[1] * lines[1] + line[2] * lines[2]
+    return found
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """A quantile of `values` with `weights`, whole numbers of the same shape."""
+    order = np.argsort(values, axis=None, kind="stable")
+    total = np.cumsum(weights.reshape(-1)[order])
+    return float(values.reshape(-1)[order[int(np.searchsorted(total, share * total[-1]))]])
+
+
+def look(
+    name: str, position: np.ndarray, direction: np.ndarray, up: np.ndarray, width: int, height: int, focal: float
+) -> Camera:
+    """A camera at `position` that looks along `direction`; the top of the image points to `up` (all [3], world)."""
+    forward = direction / _length(direction)
+    right = np.cross(forward, up)
+    if _length(right) < 1e-3:  # straight up or down: any roll will do
+        right = np.cross(forward, np.roll(up, 1))
+    right /= _length(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    shift = -(rotation * position).sum(axis=1)
+    return Camera(name, width, height, rotation, shift, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def _length(line: np.ndarray) -> float:
+    return math.sqrt(float((line * line).sum()))
