@@ -25,8 +25,9 @@ MSE_FLOOR = 1e-12
 BLIND_DROP = 1.0
 """A photo that would not show a larger drop than this does not judge its view, dB: see `far_bases`."""
 
-MOVED = 0.0017
-"""By this angle pictures are moved to tell how far photos may be from them, radians: a tenth of a degree."""
+MOVED = 0.0015
+"""By this angle pictures are moved to tell how far photos may be from them, radians: three quarters of a pixel of an automatic
+view."""
 LONE_BASES = 28.0, 36.0
 """Least and largest base without photos, dB: those of usual models."""
 
@@ -140,7 +141,7 @@ def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
     """Assumed PSNR of an original against photos that are not there, dB.
 
     Pictures with much detail are farther from their photos than those with little, about as far as from themselves when they
-    are moved by a tenth of a degree: docs/results/tuning.md#default_base_psnr
+    are moved by three quarters of a pixel: docs/results/tuning.md#default_base_psnr
 
     Parameters
     ----------
