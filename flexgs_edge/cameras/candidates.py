@@ -248,8 +248,8 @@ class Stage:
         stands *= fullest > 0
         fullest = np.maximum(fullest, 1.0)
         # A Gaussian counts with the root of what the best view shows of it: rare and faint ones are to be seen too.
-        # One that stands for many counts with their root: dense textures are not all there is to see.
-        root = np.rint(16 * np.sqrt(scene.stands) * (needed > 0) * np.sqrt(1024 / fullest))
+        # One that stands for many counts for fewer: dense textures are not all there is to see.
+        root = np.rint(16 * np.sqrt(scene.stands * np.sqrt(scene.stands)) * (needed > 0) * np.sqrt(1024 / fullest))
         shown = np.zeros(fullest.size)
         room = np.ones(len(self.views))
         # The gain of a view only falls, so an older gain is an upper bound. Few views are looked at again for each one.

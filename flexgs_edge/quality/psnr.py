@@ -30,8 +30,9 @@ FIT_PIXELS = 1 << 16
 LEAST_GAIN = 0.5
 """A fit counts if it lowers the error by this much, dB. Without a smaller one, a drop of 1 dB reads as .9 dB or more."""
 
-MOVED = 0.0017
-"""By this angle pictures are moved to tell how far photos may be from them, radians: a tenth of a degree."""
+MOVED = 0.0015
+"""By this angle pictures are moved to tell how far photos may be from them, radians: three quarters of a pixel of an automatic
+view."""
 LONE_BASES = 28.0, 36.0
 """Least and largest base without photos, dB: those of usual models."""
 
@@ -141,7 +142,7 @@ def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
     """Assumed PSNR of an original against photos that are not there, dB.
 
     Pictures with much detail are farther from their photos than those with little, about as far as from themselves when they
-    are moved by a tenth of a degree: docs/results/tuning.md#default_base_psnr
+    are moved by three quarters of a pixel: docs/results/tuning.md#default_base_psnr
 
     Parameters
     ----------

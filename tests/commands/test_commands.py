@@ -233,7 +233,8 @@ def test_views_of_a_lone_scene_are_made_from_it(tmp_path: Path, project: Path) -
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
     for result in (alone, asked):
         assert result.views is not None and result.views.cameras == "auto" and result.views.images is None
-        assert (result.views.total, result.views.held_out, result.views.width) == (48, 6, 32)
+        assert result.views.total >= 40 and result.views.width == 32
+        assert result.views.held_out == -(-result.views.total // 8)
         assert any("automatic views" in note for note in result.views.notes)
         assert result.quality is not None and result.quality.drop is None
     text = alone.summary()

@@ -72,7 +72,7 @@ def test_the_base_follows_from_the_detail_of_the_pictures() -> None:
     rng = np.random.default_rng(0)
     flat, rough = np.full((60, 80, 3), 0.5, np.float32), rng.uniform(0, 1, (60, 80, 3)).astype(np.float32)
     ramp = np.broadcast_to(np.linspace(0, 1, 80, dtype=np.float32)[None, :, None], (60, 80, 3))
-    assert moved_error(flat, 500.0) == 0 and moved_error(rough, 500.0) > 0.1
+    assert moved_error(flat, 1 / MOVED) == 0 and moved_error(rough, 1 / MOVED) > 0.1
     # A ramp that is moved by a pixel changes by 1 / 79, in one of the two directions.
     assert moved_error(ramp, 1 / MOVED) == pytest.approx(0.5 / 79**2, rel=1e-3)
     assert moved_error(ramp, 0.5 / MOVED) == pytest.approx(0.125 / 79**2, rel=1e-3)
