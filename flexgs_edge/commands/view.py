@@ -21,7 +21,7 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.header import Header
 from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import BitSpec
@@ -30,7 +30,7 @@ from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
-from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
 from flexgs_edge.viewer.scene_page import page_config, viewer_page
@@ -67,7 +67,17 @@ def view(
         check_writable(output, force)
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: expected 0 to 65535")
-    run = open_run(input, replace(options or ViewOptions(), **words), progress, photos=False, decodes=False)
+    options = replace(options or ViewOptions(), **words)
+    try:
+        run = open_run(input, options, progress, photos=False, decodes=False)
+    except (
+        BudgetError,
+        DeviceError,
+    ) as error:  # a page draws without one; only views without cameras are placed by a device
+        if options.device is not None or options.cameras not in (None, AUTO_CAMERAS):
+            raise
+        LOG.warning("warning: the page opens without prepared views: %s", error)
+        run = open_run(input, replace(options, cameras=NO_CAMERAS, up=None), progress, photos=False, decodes=False)
     run.budget.require("the program", 0)
     cameras = [] if run.views is None else list(run.views.cameras)
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.commands.view import view
 from flexgs_edge.commands.views import LABEL, WIDTH, draw_sheet
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.quality.psnr import LONE_BASES, MOVED, lone_base, moved_error
 from flexgs_edge.run.options import ViewOptions
@@ -51,6 +52,20 @@ def test_up_turns_automatic_views(lone: Path) -> None:
     assert "up is +x (--up)" in run.seen.notes[0]
     assert all(abs(camera.rotation[0, 0]) < 1e-12 for camera in run.seen.cameras)
     assert "up is -y (convention)" in open_run(lone, ViewOptions()).seen.notes[0]
+
+
+@pytest.mark.parametrize("kind", [DeviceError, BudgetError])
+def test_a_page_needs_no_device(
+    tmp_path: Path, lone: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, kind: type[Exception]
+) -> None:
+    def fail(*_: object) -> None:
+        raise kind("no device here")
+
+    monkeypatch.setattr("flexgs_edge.run.view_set.counted_backend", fail)
+    assert view(lone, tmp_path / "a.html").views == 0
+    assert "opens without prepared views: no device here" in caplog.text
+    with pytest.raises(kind):
+        view(lone, tmp_path / "b.html", device="cpu")
 
 
 def test_a_sheet_shows_all_views(tmp_path: Path, lone: Path) -> None:
