@@ -277,6 +277,8 @@ def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
         CompressOptions(**words)
 
 
-def test_other_formats_have_grids_of_their_own(project: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="distilling ends on the grid of a .fgs"):
-        compress(project / "point_cloud.ply", tmp_path / "a.spz", distil=10)
+def test_files_of_other_formats_are_fine_tuned_too(project: Path, tmp_path: Path) -> None:
+    words: dict[str, Any] = {"effort": "fast", "promise": "mean", "max_size": 6000}
+    plain, tuned = (compress(project / "point_cloud.ply", tmp_path / f"{n}.spz", distil=n, **words) for n in (0, 40))
+    assert plain.quality is not None and tuned.quality is not None
+    assert tuned.quality.error < plain.quality.error
