@@ -14,6 +14,9 @@ from flexgs_edge.commands.info import info
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.io.formats import FORMATS, WRITTEN
 from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.fields import FIELD
 
 READ: dict[str, tuple[int, int]] = {
@@ -48,7 +51,7 @@ REFUSED = {
     "lfs-pointer.ply": "Git LFS pointer",
 }
 SMALL = [name for name, (count, _) in READ.items() if count <= 100]
-QUICK: dict[str, Any] = {"effort": "fast", "resolution": 160}
+QUICK: dict[str, Any] = {"effort": "fast"}
 
 
 @pytest.mark.parametrize("name", READ)
@@ -83,8 +86,10 @@ def test_small_files_go_to_every_format(wild: Path, tmp_path: Path, short_search
         kept = min(degree, FORMATS[suffix].max_degree) if suffix in FORMATS else degree
         back = open_scene(tmp_path / f"whole{suffix}")
         assert (back.count, back.sh_degree) == (count, kept)
+    views = open_run(wild / name, ViewOptions()).seen
+    given = GivenViews([camera.scaled(160, 120) for camera in views.cameras[:16]])
     for suffix in (".fgs", *WRITTEN):
-        result = compress(wild / name, tmp_path / f"small{suffix}", **QUICK)
+        result = compress(wild / name, tmp_path / f"small{suffix}", given=given, near=views.near, **QUICK)
         back = open_scene(tmp_path / f"small{suffix}")
         assert 1 <= back.count == result.count <= count
 
