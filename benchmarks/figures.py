@@ -150,7 +150,7 @@ def promise_figures(record: dict[str, Any]) -> tuple[str, ...]:
     parts = {part["name"]: part for part in promise["parts"]} if promise else {}
     worst = parts.get("worst view")
     return (
-        f"{quality['worst']['drop']:.3f}",
+        f"{quality['worst']['loss']:.3f}",
         f"{worst['allowed']:.3f}" if worst else "",
         f"{quality['original_ssim'] - quality['ssim']:.4f}",
         f"{quality['flip']:.4f}",
