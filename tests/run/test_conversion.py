@@ -131,7 +131,7 @@ def test_scenes_far_from_zero_are_refused_or_moved(far: Path, suffix: str, tmp_p
     assert beside["axes"] == ("RUB" if suffix == ".spz" else "RDF")
     np.testing.assert_array_equal(beside["offset"], read_scene(far).origin * signs)
     assert found.loss is not None and found.loss.values["position_by_size"][0] < 0.1
-    assert found.loss.drop is not None and found.loss.drop < 2.5
+    assert found.loss.fidelity is not None and found.loss.fidelity > 30
     path.unlink()
     with pytest.raises(InputError, match=r"offset\.json: the file exists"):
         decompress(far, path, recenter=True)
