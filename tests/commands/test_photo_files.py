@@ -59,6 +59,6 @@ def test_photos_of_something_else_count_as_none(project: Path, tmp_path: Path) -
     quality = result.quality
     assert quality is not None and all(view.far_base == quality.base_psnr for view in quality.views)
     assert quality.usual_drop is not None and 0.0 < quality.usual_drop <= 2.0
-    words = {"max_drop": 2.0, "images": "none", **FAST}
+    words = {"max_drop": 2.0, "images": "none", "base_psnr": quality.base_psnr, **FAST}
     alone = compress(project / "point_cloud.ply", tmp_path / "alone.fgs", **words)
     assert result.count >= 0.7 * alone.count and "far from its photo" in result.summary()
