@@ -76,6 +76,8 @@ def test_pictures_that_are_not_compared_have_a_reason(planes: Planes, tmp_path: 
     assert unseen.loss is not None and unseen.loss.views == 0 and "not compared: --cameras none" in unseen.summary()
     elsewhere = decompress(tmp_path / "a.ply", tmp_path / "b.spz", device="no such device")
     assert elsewhere.loss is not None and "no such device" in elsewhere.loss.why
+    twins = decompress(tmp_path / "a.ply", tmp_path / "e.spz", device="numpy")
+    assert twins.loss is not None and "NumPy draws slowly" in twins.loss.why
     limit = MemoryBudget.from_limit(None).used + 40 * 2**20
     tight = decompress(tmp_path / "a.ply", tmp_path / "d.spz", memory_limit=limit)
     assert tight.loss is not None and "the OpenCL runtime needs 112MiB" in tight.loss.why

@@ -56,9 +56,9 @@ def test_a_scene_that_does_not_fit_decoded_has_room_for_its_decoding(file: Path)
 def test_other_formats_have_the_same_bytes_either_way(
     suffix: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    decompress(file, tmp_path / f"once{suffix}", force_lossy=True)
+    decompress(file, tmp_path / f"once{suffix}", force_lossy=True, cameras="none")
     monkeypatch.setattr(command, "decoded_once", lambda source, *_: source)
-    decompress(file, tmp_path / f"again{suffix}", force_lossy=True)
+    decompress(file, tmp_path / f"again{suffix}", force_lossy=True, cameras="none")
     assert (tmp_path / f"once{suffix}").read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
 
 
