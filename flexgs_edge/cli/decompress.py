@@ -24,7 +24,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--cameras",
     metavar="PATH",
     help="Cameras of the pictures that show what another program's format loses. none: no pictures. Default: cameras beside "
-    "the scene, else generated views.",
+    "the scene, else generated views (with --device numpy: none).",
 )
 @shared_options.reading_options
 @help_page.option(

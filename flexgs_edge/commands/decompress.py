@@ -116,7 +116,7 @@ def decompress(
         )
     if cameras not in (None, AUTO_CAMERAS, NO_CAMERAS):
         read_cameras(cameras)
-    writing = Writing(spz_version, force_lossy=force_lossy)
+    writing = Writing(spz_version)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
@@ -127,10 +127,9 @@ def decompress(
         recenter = recenter and bool(np.any(scene.source.origin))
         if recenter:
             check_writable(offset_place(output), force)
-        written = MovedSource(scene.source, np.zeros(3)) if recenter else scene.source
-        warnings = check_positions(written, format, force_lossy) if format is not None else ()
     antialiased = scene.settings.get("antialiased") is True
     backend = decoder(device, scene.source, budget, clock)
+    warnings: tuple[str, ...] = ()
     with clock.stage("write"):
         if format is not None:
             needed = format.memory * scene.source.count
@@ -138,7 +137,8 @@ def decompress(
             source = decoded_once(scene.source, budget, needed, backend)
             scene = replace(scene, source=source)
             source = MovedSource(source, np.zeros(3)) if recenter else source
-            writing = replace(writing, antialiased=antialiased)
+            warnings = check_positions(source, format, force_lossy)
+            writing = Writing(spz_version, antialiased, force_lossy=True)  # positions are checked
             if streamed:
                 layers, preview = _layers(input, source.count, reading)
                 notes = write_streamed(

@@ -21,7 +21,7 @@ from flexgs_edge.io.streamed_sog_writer import write_streamed_sog
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
-from flexgs_edge.scene.source import Planes, Rows, SceneSource
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
 
 _FINER = 10.0
 """A scene is too far from zero for a format if its positions would be so many times finer at zero."""
@@ -126,16 +126,12 @@ def _notes(source: SceneSource, format: Format) -> tuple[str, ...]:
     return notes
 
 
-def written_order(source: SceneSource) -> np.ndarray:
-    """[N] i64, rows of `source` in the order that `write_foreign` writes them."""
-    return near_order(source)
-
-
 def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
-    """[N] i64, the rows along a Morton curve through the box of the scene, far ones last, by octaves of their distance.
+    """[N] i64, rows of `source` in the order that `write_foreign` writes them.
 
-    Formats whose chunks share a range would else lose the digits of near rows to far ones beside them. One chunk has rows of
-    both kinds: its near ones are the faintest.
+    They lie along a Morton curve through the box of the scene, far ones last, by octaves of their distance. Formats
+    whose chunks share a range would else lose the digits of near rows to far ones beside them. One chunk has rows of both
+    kinds: its near ones are the faintest.
     """
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
     order = near_rows(means)
@@ -254,31 +250,28 @@ def write_offset(path: str | os.PathLike[str], origin: np.ndarray, format: Forma
     return f"moved to zero: add the offset in {place}"
 
 
-class MovedSource(SceneSource):
+class MovedSource(WrappedSource):
     """A scene that is moved as a whole: the same values around another origin."""
 
     def __init__(self, parent: SceneSource, origin: np.ndarray) -> None:
-        self.parent, self.name, self.notes, self.origin = parent, parent.name, parent.notes, origin
-        self.count, self.sh_degree, self.sh_count = parent.count, parent.sh_degree, parent.sh_count
-        self.settings, self.held_bytes, self.valid = parent.settings, parent.held_bytes, parent.valid
+        super().__init__(parent)
+        self.origin = origin
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""
         return self.parent.read(rows, fields, out)
 
 
-class _WorldSource(SceneSource):
+class _WorldSource(WrappedSource):
     """A scene as writers need it: world positions in float32, and unit quaternions.
 
     Most formats have no digits for an origin, and can only hold unit quaternions.
     """
 
     def __init__(self, parent: SceneSource, keep_origin: bool = False) -> None:
-        self.parent, self.name, self.notes = parent, parent.name, parent.notes
+        super().__init__(parent)
         self.origin = parent.origin if keep_origin else np.zeros(3)
         self.moved = bool(np.any(parent.origin != self.origin))
-        self.count, self.sh_degree, self.sh_count = parent.count, parent.sh_degree, parent.sh_count
-        self.settings, self.held_bytes, self.valid = parent.settings, parent.held_bytes, parent.valid
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`."""

@@ -10,7 +10,7 @@ import numpy as np
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.codes import opacities
-from flexgs_edge.io.exchange import MovedSource, written_order
+from flexgs_edge.io.exchange import MovedSource, near_order
 from flexgs_edge.report.file_results import ConversionLoss
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.inputs import CheckedScene, load_scene
@@ -46,7 +46,7 @@ def conversion_loss(
     options : ViewOptions
         Cameras, device and memory limit of the pictures.
     ordered : bool
-        The file's rows have the order of `written_order`, so that values can be compared.
+        The file's rows have the order of `near_order`, so that values can be compared.
     recentred : bool
         The file's scene was moved to zero.
 
@@ -91,7 +91,7 @@ def conversion_loss(
 
 def _value_errors(source: SceneSource, written: SceneSource) -> dict[str, tuple[float, float]]:
     """Median and largest errors of some rows by value; the size of a splat is its largest deviation."""
-    order = written_order(source)
+    order = near_order(source)
     rows = np.arange(0, source.count, -(-source.count // _ROWS))
     fields = ["means", "log_scales", "opacity_logits", "sh_dc"]
     before, after = source.select(order[rows]).read(slice(0, rows.size), fields), written.read(rows, fields)

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexgs_edge.api.scene import Scene
 from flexgs_edge.errors import FormatError
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.reading import PLAIN, Writing
 from flexgs_edge.run.inputs import checked_scene
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
@@ -40,7 +40,7 @@ def there_and_back(path: Path, source: SceneSource, writing: Writing = PLAIN) ->
     write_foreign(path, source, writing=writing)
     back = read_foreign(path)
     assert (back.count, back.sh_degree, back.name) == (source.count, source.sh_degree, str(path))
-    return planes_of(source.select(written_order(source))), planes_of(back)
+    return planes_of(source.select(near_order(source))), planes_of(back)
 
 
 def opacities(planes: Planes) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 
 from exchanged import degrees_apart, largest_errors, opacities, planes_of, psnr_after, refused, scene, there_and_back
 from flexgs_edge.io.compressed_ply import CHUNK
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.source import MemorySource
@@ -103,7 +103,7 @@ def test_values_beyond_the_codes(tmp_path: Path) -> None:
     planes["means"][0] = [3e38, -3e38, 0, 0]
     source = MemorySource(planes, 0)
     _, after = there_and_back(tmp_path / NAME, source)
-    rows = np.argsort(written_order(source))
+    rows = np.argsort(near_order(source))
     np.testing.assert_allclose(after["opacity_logits"][0, rows], [-7, 7, 0, 0], atol=0.01)
     np.testing.assert_allclose(after["log_scales"][0, rows], [-20, 20, -20, 0], atol=0.02)
     np.testing.assert_allclose(after["means"][0, rows[:2]], [3e38, -3e38])

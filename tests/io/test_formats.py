@@ -15,7 +15,7 @@ from flexgs_edge.api.scene import Scene
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.decoded import OPACITY_LIMIT
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS, WRITTEN, format_of, written_format
 from flexgs_edge.io.frames import RDF, RUB, in_frame
 from flexgs_edge.io.ply import PlySource, write_ply
@@ -342,7 +342,7 @@ def test_positions_that_a_format_cannot_hold_are_refused(tmp_path: Path, suffix:
 def test_a_glb_holds_the_origin_exactly(tmp_path: Path) -> None:
     source = _utm()
     assert write_foreign(tmp_path / "a.glb", source) == ()
-    back, rows = read_foreign(tmp_path / "a.glb"), written_order(source)
+    back, rows = read_foreign(tmp_path / "a.glb"), near_order(source)
     every = slice(0, source.count)
     means = back.read(every, ["means"])["means"] + back.origin[:, None]
     expected = source.read(every, ["means"])["means"][:, rows] + source.origin[:, None]
@@ -351,8 +351,8 @@ def test_a_glb_holds_the_origin_exactly(tmp_path: Path) -> None:
 
 def test_far_rows_come_last_by_octaves() -> None:
     near = planes_of(scene(600, 0))
-    order = written_order(MemorySource(near))
+    order = near_order(MemorySource(near))
     means = near["means"].copy()
     means[:, 7::100] *= 1e6
-    moved = written_order(MemorySource(near | {"means": means}))
+    moved = near_order(MemorySource(near | {"means": means}))
     assert set(moved[-6:]) == set(range(7, 600, 100)) and set(order[-6:]) != set(moved[-6:])

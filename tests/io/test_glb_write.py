@@ -12,7 +12,7 @@ import pytest
 
 from flexgs_edge._version import __version__
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.io.glb_writer import write_glb
 from flexgs_edge.io.reading import PLAIN
@@ -30,7 +30,7 @@ def written(source: SceneSource, path: Path) -> tuple[Planes, Planes]:
     assert write_foreign(path, source) == ()
     back = read_foreign(path)
     assert back.notes == ()
-    ours = source.select(written_order(source)).read(slice(0, source.count), list(FIELD))
+    ours = source.select(near_order(source)).read(slice(0, source.count), list(FIELD))
     ours["quats"] = normalize_quats(ours["quats"])
     theirs = back.read(slice(0, back.count), list(FIELD))
     # Quaternions q and -q turn the same way.

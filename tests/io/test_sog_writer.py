@@ -12,7 +12,7 @@ import pytest
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.codes import SMALLER, rounded_quats, unpack_small
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.io.frames import RUB, in_frame
 from flexgs_edge.io.reading import Writing
@@ -43,7 +43,7 @@ def back_and_forth(path: Path, source: SceneSource, writing: Writing | None = No
     back = read_foreign(path)
     assert (back.count, back.sh_degree) == (source.count, source.sh_degree)
     every = slice(0, source.count)
-    return source.select(written_order(source)).read(every, list(FIELD)), back.read(every, list(FIELD))
+    return source.select(near_order(source)).read(every, list(FIELD)), back.read(every, list(FIELD))
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import pytest
 
 from exchanged import degrees_apart, largest_errors, planes_of, psnr_after, refused, scene, there_and_back
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import PLAIN
 from flexgs_edge.io.splat import write_splat
@@ -64,7 +64,7 @@ def test_values_beyond_the_codes(tmp_path: Path) -> None:
     planes["sh_dc"][0] = [-9, 9, 0]
     source = MemorySource(planes, 0)
     _, after = there_and_back(tmp_path / "a.splat", source)
-    rows = np.argsort(written_order(source))
+    rows = np.argsort(near_order(source))
     np.testing.assert_allclose(after["opacity_logits"][0, rows], [-7, 7, 0], atol=0.01)
     np.testing.assert_allclose(after["log_scales"][0, rows], [-np.inf, 88.72284, -np.inf])
     np.testing.assert_allclose(after["sh_dc"][0, rows] * 0.28209479, [-0.5, 0.5, 0], atol=0.002)

@@ -13,7 +13,7 @@ import zstandard
 
 from exchanged import degrees_apart, largest_errors, planes_of, psnr_after, refused, scene, there_and_back
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.io.exchange import read_foreign, write_foreign, written_order
+from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.frames import RUB, Frame, in_frame
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import Reading, Writing
@@ -163,7 +163,7 @@ def test_values_beyond_the_codes(tmp_path: Path) -> None:
     planes["sh_rest"][0] = [-9, 9, 0]
     source = MemorySource(planes, 1)
     _, after = there_and_back(tmp_path / "a.spz", source)
-    rows = np.argsort(written_order(source))
+    rows = np.argsort(near_order(source))
     np.testing.assert_allclose(after["opacity_logits"][0, rows], [-7, 7, 0], atol=0.01)
     np.testing.assert_allclose(after["log_scales"][0, rows], [-10, 5.9375, -10])
     np.testing.assert_allclose(after["sh_dc"][0, rows], [-10 / 3, 10 / 3, 0], atol=0.02)

@@ -54,7 +54,8 @@ many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
-FIXED_BITS = 2.0**-8  # Share of the multiplier that chooses steps where coarser ones save no bytes
+FIXED_BITS = 2.0**-8
+"""Share of the multiplier that chooses steps where coarser ones save no bytes: so fine that only the format rounds."""
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 PRICED, ABOVE = -0.035, 0.02

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,21 +49,25 @@ class FileMaker:
 
     def write(self, source: SceneSource) -> tuple[Path, SceneSource]:
         """Write the file of a scene; returns its path and the decoded scene."""
+        self._write(source, self.writing)
+        return self._path, read_foreign(self._path)
+
+    def of(self, grid: GridScene) -> Path:
+        """The file of a grid. Positions of the whole scene are checked before the search, and not once more here."""
+        if grid is not self._grid:
+            self._grid = None
+            self._write(MemorySource(values_of(grid), origin=grid.origin), replace(self.writing, force_lossy=True))
+            self._grid = grid
+        return self._path
+
+    def _write(self, source: SceneSource, writing: Writing) -> None:
+        """Write a file; writing and reading back may take `Format.memory` for each row."""
         size = self.format.memory * source.count
         self._budget.take(f"writing a {self.format.suffix}", size)
         try:
-            write_foreign(self._path, source, force=True, writing=self.writing)
-            return self._path, read_foreign(self._path)
+            write_foreign(self._path, source, force=True, writing=writing)
         finally:
             self._budget.give(size)
-
-    def of(self, grid: GridScene) -> Path:
-        """The file of a grid."""
-        if grid is not self._grid:
-            self._grid = None
-            self.write(MemorySource(values_of(grid), origin=grid.origin))
-            self._grid = grid
-        return self._path
 
     def size_of(self, grid: GridScene) -> int:
         """Bytes of the file of a grid."""
