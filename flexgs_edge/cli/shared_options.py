@@ -154,7 +154,7 @@ base_psnr_option = option(
     metavar="DB",
     type=float,
     help="The modelled drop (the estimate without photos) assumes this PSNR of the original against its photos. "
-    "Higher is more cautious. Default: PSNR of its views against themselves, moved by three quarters of a pixel (28 to 36).",
+    "Higher is more cautious. Default: PSNR of its views against themselves, moved by three quarters of a pixel (32.5 to 36).",
 )
 drop_invalid_option = option(
     VIEWS,
