@@ -18,7 +18,7 @@ from flexgs_edge.cli import help_page, shared_options, talk
     help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
 )
 @shared_options.positions_options
-@shared_options.spz_version_option
+@shared_options.writing_options
 @help_page.option(
     help_page.VIEWS,
     "--cameras",
@@ -42,6 +42,7 @@ def command(
     recenter: bool,
     force_lossy: bool,
     spz_version: int,
+    glb: str,
     cameras: str | None,
     frame: str | None,
     lod: int | None,
@@ -76,10 +77,9 @@ def command(
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.decompress import decompress
-    from flexgs_edge.io.reading import Reading
+    from flexgs_edge.io.reading import Reading, Writing
 
     reading = Reading.of(frame, lod, sh_degree)
-    result = decompress(
-        input, output, force, memory_limit, device, reading, spz_version, force_lossy, recenter, cameras
-    )
+    writing = Writing(spz_version, force_lossy=force_lossy, glb=glb)
+    result = decompress(input, output, force, memory_limit, device, reading, writing, recenter, cameras)
     talk.emit(result.summary(), result.to_json(), json_path, force)

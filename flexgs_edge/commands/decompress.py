@@ -26,7 +26,7 @@ from flexgs_edge.io.exchange import (
 )
 from flexgs_edge.io.formats import FORMATS, WRITTEN, Format, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
-from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
+from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
@@ -56,8 +56,7 @@ def decompress(
     memory_limit: int | None = None,
     device: str | None = None,
     reading: Reading = AS_WRITTEN,
-    spz_version: int = 3,
-    force_lossy: bool = False,
+    writing: Writing = PLAIN,
     recenter: bool = False,
     cameras: str | None = None,
 ) -> DecompressResult:
@@ -77,10 +76,8 @@ def decompress(
         Bytes for the whole process. Default: three quarters of the free memory.
     reading : Reading, optional
         Frame, level of detail and SH degree.
-    spz_version : {3, 4}
-        Version of a `.spz`.
-    force_lossy : bool
-        Write a scene also where the format cannot hold its positions, see `check_positions`.
+    writing : Writing, optional
+        How another program's format is written.
     recenter : bool
         Move a scene that lies far from zero to zero, and write the offset beside `output` (other programs' formats).
     cameras : str, optional
@@ -102,21 +99,20 @@ def decompress(
         If the input does not follow its format.
     """
     streamed = Path(output).name == STREAMED
-    format = FORMATS[".sog"] if streamed else written_format(output)
+    format = FORMATS[".sog"] if streamed else written_format(output, writing)
     if format is None and Path(output).suffix.lower() != ".ply":
         raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(WRITTEN)}, or {STREAMED}")
     if streamed:
         check_folder(Path(output).parent, force)
     else:
         check_writable(output, force)
-    if format is None and (recenter or force_lossy):
+    if format is None and (recenter or writing.force_lossy):
         raise InputError(
             f"--{'recenter' if recenter else 'force-lossy'}: a .ply holds the scene as it is; leave it out, or write one of "
             f"{', '.join(WRITTEN)}"
         )
     if cameras not in (None, AUTO_CAMERAS, NO_CAMERAS):
         read_cameras(cameras)
-    writing = Writing(spz_version)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
@@ -137,8 +133,8 @@ def decompress(
             source = decoded_once(scene.source, budget, needed, backend)
             scene = replace(scene, source=source)
             source = MovedSource(source, np.zeros(3)) if recenter else source
-            warnings = check_positions(source, format, force_lossy)
-            writing = Writing(spz_version, antialiased, force_lossy=True)  # positions are checked
+            warnings = check_positions(source, format, writing.force_lossy)
+            writing = replace(writing, antialiased=antialiased, force_lossy=True)  # positions are checked
             if streamed:
                 layers, preview = _layers(input, source.count, reading)
                 notes = write_streamed(

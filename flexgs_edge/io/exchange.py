@@ -82,7 +82,7 @@ def write_foreign(
     BudgetError
         If the disk is full.
     """
-    format = written_format(path)
+    format = written_format(path, writing)
     assert format is not None
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {path}")

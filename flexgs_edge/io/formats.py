@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame
+from flexgs_edge.io.reading import PLAIN, Writing
 
 
 def _as_float32(means: np.ndarray, largest: float) -> np.ndarray:
@@ -132,6 +133,10 @@ FORMATS: dict[str, Format] = {
         Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
     )
 }  # fmt: skip
+_GLB_SPZ = replace(
+    FORMATS[".glb"], writer=f"{_IO}.glb_writer:write_glb_spz", reach=FORMATS[".spz"].reach, position_error=_fixed_point,
+    fixed_rows=False, marks_antialiased=True,
+)  # fmt: skip
 WRITTEN: tuple[str, ...] = tuple(suffix for suffix, format in FORMATS.items() if format.writer)
 """Suffixes that can be written."""
 
@@ -142,9 +147,9 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
 
 
-def written_format(path: str | os.PathLike[str]) -> Format | None:
+def written_format(path: str | os.PathLike[str], writing: Writing = PLAIN) -> Format | None:
     """The format that a file of this name is written in, or None; raises `InputError` for formats that are only read."""
     format = format_of(path)
     if format is not None and format.writer is None:
         raise InputError(f"-o {path}: {format.suffix} files are only read; write one of {', '.join(WRITTEN)}")
-    return format
+    return _GLB_SPZ if format is FORMATS[".glb"] and writing.glb == "spz" else format

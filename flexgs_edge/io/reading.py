@@ -31,6 +31,9 @@ class Reading:
             raise InputError(f"--lod {self.lod}: expected 0 (the finest level) or more")
 
 
+GLB_KINDS = ("plain", "spz")
+
+
 @dataclass(frozen=True)
 class Writing:
     """How to write another program's format."""
@@ -39,10 +42,13 @@ class Writing:
     antialiased: bool = False  # the model is antialiased; formats that can say so, do
     # Write a scene also where the format cannot hold its positions: see `check_positions`.
     force_lossy: bool = False
+    glb: str = "plain"  # What holds the values of a `.glb`: `plain` numbers or a `spz`.
 
     def __post_init__(self) -> None:
         if self.spz_version not in (3, 4):
             raise InputError(f"--spz-version {self.spz_version}: expected 3 or 4")
+        if self.glb not in GLB_KINDS:
+            raise InputError(f"--glb {self.glb}: expected {' or '.join(GLB_KINDS)}")
 
 
 AS_WRITTEN = Reading()
