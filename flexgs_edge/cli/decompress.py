@@ -15,7 +15,8 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--output",
     metavar="OUT",
     required=True,
-    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
+    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, .usd, .usda, .usdc, .usdz, or FOLDER/lod-meta.json "
+    "(streamed SOG).",
 )
 @shared_options.positions_options
 @shared_options.writing_options

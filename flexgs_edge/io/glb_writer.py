@@ -108,8 +108,8 @@ def _attributes(sh_degree: int) -> list[_Attribute]:
         _Attribute("POSITION", _FLOAT, "VEC3", lambda planes: planes["means"]),
         _Attribute("COLOR_0", _UNSIGNED_BYTE, "VEC4", _colours),
         _Attribute(f"{EXTENSION}:ROTATION", _SHORT, "VEC4", lambda planes: planes["quats"][[1, 2, 3, 0]]),
-        _Attribute(f"{EXTENSION}:SCALE", _FLOAT, "VEC3", _scales),
-        _Attribute(f"{EXTENSION}:OPACITY", _FLOAT, "SCALAR", _opacities),
+        _Attribute(f"{EXTENSION}:SCALE", _FLOAT, "VEC3", linear_scales),
+        _Attribute(f"{EXTENSION}:OPACITY", _FLOAT, "SCALAR", plain_opacities),
         _Attribute(f"{EXTENSION}:SH_DEGREE_0_COEF_0", _FLOAT, "VEC3", lambda planes: planes["sh_dc"]),
     ]
     for degree in range(1, sh_degree + 1):
@@ -178,14 +178,16 @@ def _bounds(source: SceneSource) -> dict[str, list[float]]:
     return {"min": low.tolist(), "max": high.tolist()}
 
 
-def _scales(planes: Planes) -> np.ndarray:
+def linear_scales(planes: Planes) -> np.ndarray:
+    """[3, n] f64, standard deviations."""
     # Neither zero nor infinite, which a reader could not take back.
     limits = np.finfo(np.float32)
     found: np.ndarray = np.clip(_exp(planes["log_scales"]), limits.tiny, limits.max)
     return found
 
 
-def _opacities(planes: Planes) -> np.ndarray:
+def plain_opacities(planes: Planes) -> np.ndarray:
+    """[1, n] f64, 0 to 1."""
     found: np.ndarray = 1 / (1 + _exp(-planes["opacity_logits"]))
     return found
 
@@ -193,7 +195,7 @@ def _opacities(planes: Planes) -> np.ndarray:
 def _colours(planes: Planes) -> np.ndarray:
     """[4, n], what a viewer without splats shows: colours without SH, and opacities."""
     colours = np.clip(planes["sh_dc"].astype(np.float64) * SH_C0 + 0.5, 0, 1)
-    found: np.ndarray = np.concatenate([colours, _opacities(planes)])
+    found: np.ndarray = np.concatenate([colours, plain_opacities(planes)])
     return found
 
 
