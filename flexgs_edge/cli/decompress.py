@@ -21,6 +21,13 @@ from flexgs_edge.cli import help_page, shared_options, talk
 @shared_options.positions_options
 @shared_options.writing_options
 @help_page.option(
+    help_page.OUTPUT,
+    "--double",
+    is_flag=True,
+    help="Write x y z of a .ply as doubles, which not every program reads. Default: the type that came in. A .fgs does not keep "
+    "it: floats, unless they would ruin a scene far from zero.",
+)
+@help_page.option(
     help_page.VIEWS,
     "--cameras",
     metavar="PATH",
@@ -44,6 +51,7 @@ def command(
     force_lossy: bool,
     spz_version: int,
     glb: str,
+    double: bool,
     cameras: str | None,
     frame: str | None,
     lod: int | None,
@@ -59,8 +67,8 @@ def command(
     INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply file, or a model folder. Decoding a .fgs is exact: the same bits on
     every machine.
 
-    A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats, little endian.
-    Gaussians without view-dependent colour get zeros for it.
+    A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats (--double: x y z
+    as 64-bit ones), little endian. Gaussians without view-dependent colour get zeros for it.
 
     Formats of other programs round values in their own ways. What that loses is measured and printed. To make such a file
     smaller, use compress.
@@ -81,6 +89,6 @@ def command(
     from flexgs_edge.io.reading import Reading, Writing
 
     reading = Reading.of(frame, lod, sh_degree)
-    writing = Writing(spz_version, force_lossy=force_lossy, glb=glb)
+    writing = Writing(spz_version, force_lossy=force_lossy, glb=glb, double=double)
     result = decompress(input, output, force, memory_limit, device, reading, writing, recenter, cameras)
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -20,6 +20,7 @@ from flexgs_edge.io.exchange import (
     MovedSource,
     check_positions,
     offset_place,
+    wants_double,
     write_foreign,
     write_offset,
     write_streamed,
@@ -62,7 +63,7 @@ def decompress(
 ) -> DecompressResult:
     """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
 
-    The PLY is little endian with zero normals, and is written chunk by chunk.
+    The PLY is little endian with zero normals, and is written chunk by chunk. Its positions have the type that came in.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def decompress(
     reading : Reading, optional
         Frame, level of detail and SH degree.
     writing : Writing, optional
-        How another program's format is written.
+        How the file is written.
     recenter : bool
         Move a scene that lies far from zero to zero, and write the offset beside `output` (other programs' formats).
     cameras : str, optional
@@ -111,6 +112,8 @@ def decompress(
             f"--{'recenter' if recenter else 'force-lossy'}: a .ply holds the scene as it is; leave it out, or write one of "
             f"{', '.join(WRITTEN)}"
         )
+    if format is not None and writing.double:
+        raise InputError(f"--double: only a .ply has positions of another type, not {format.suffix}; leave it out")
     if cameras not in (None, AUTO_CAMERAS, NO_CAMERAS):
         read_cameras(cameras)
     clock = Stopwatch()
@@ -148,7 +151,8 @@ def decompress(
             rows = budget.rows("decoding", row, fixed=decoding + decoding // SPARE_SHARE, minimum=least, most=65536)
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
-                notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+                double, warnings = (True, ()) if writing.double else wants_double(scene.source, rows)
+                notes = write_ply(output, scene.source, force=force, chunk_rows=rows, double=double)
         if recenter:
             assert format is not None
             notes = (*notes, write_offset(output, scene.source.origin, format, force))

@@ -38,7 +38,7 @@ def planes(sample_dir: Path) -> Planes:
 def far(planes: Planes, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene in UTM coordinates."""
     path = tmp_path_factory.mktemp("far") / "utm.ply"
-    write_ply(path, MemorySource(planes, 1, UTM))
+    write_ply(path, MemorySource(planes, 1, UTM), double=True)
     return path
 
 
