@@ -154,6 +154,7 @@ class CompressOptions(ViewOptions):
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
+    glb: str = "plain"
     recenter: bool = False
     force_lossy: bool = False
     layers: int | None = None
@@ -236,7 +237,7 @@ class CompressOptions(ViewOptions):
     @property
     def writing(self) -> Writing:
         """How a file of another program's format is written."""
-        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy)
+        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy, self.glb)
 
     @property
     def unseen_share(self) -> float:

@@ -46,7 +46,7 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
 
 def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
     """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
-    format = None if output is None else written_format(output)
+    format = None if output is None else written_format(output, options.writing)
     if format is None:
         if options.recenter or options.force_lossy:
             word = "recenter" if options.recenter else "force-lossy"

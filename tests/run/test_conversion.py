@@ -13,6 +13,7 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import WARN_DROP, decompress
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.run.inputs import load_scene, read_scene
@@ -37,7 +38,7 @@ def planes(sample_dir: Path) -> Planes:
 def far(planes: Planes, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene in UTM coordinates."""
     path = tmp_path_factory.mktemp("far") / "utm.ply"
-    write_ply(path, MemorySource(planes, 1, UTM))
+    write_ply(path, MemorySource(planes, 1, UTM), double=True)
     return path
 
 
@@ -111,12 +112,12 @@ def test_a_sky_too_far_for_a_format_is_counted_first(planes: Planes, tmp_path: P
         compress(tmp_path / "a.ply", tmp_path / "a.spz", cameras="auto")
     with pytest.raises(InputError, match=words):
         decompress(tmp_path / "a.ply", tmp_path / "a.spz")
-    written = decompress(tmp_path / "a.ply", tmp_path / "a.spz", force_lossy=True, cameras="none")
+    written = decompress(tmp_path / "a.ply", tmp_path / "a.spz", writing=Writing(force_lossy=True), cameras="none")
     assert "Gaussians move by more than their own size" in written.warnings[0]
     beyond = with_sky(planes, 9e6, 2e5, 40)
     write_ply(tmp_path / "b.ply", beyond)
     with pytest.raises(InputError, match=rf"\d+ of {beyond.count} Gaussians lie beyond 8388607"):
-        decompress(tmp_path / "b.ply", tmp_path / "b.spz", force_lossy=True)
+        decompress(tmp_path / "b.ply", tmp_path / "b.spz", writing=Writing(force_lossy=True))
 
 
 @pytest.mark.parametrize("suffix", LOSSY)
