@@ -22,8 +22,8 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.candidates import MOST_VIEWS, Candidate, Show, Stage, look
 from flexgs_edge.cameras.directions import Frames
 from flexgs_edge.cameras.places import first_places
+from flexgs_edge.cameras.scene_sample import Gaussians, SceneSample, sample_scene
 from flexgs_edge.cameras.up import Stands, find_up, given_up
-from flexgs_edge.cameras.witnesses import Gaussians, Witnesses, gather_witnesses
 from flexgs_edge.errors import InputError
 
 LEAST_VIEWS = 40
@@ -96,7 +96,7 @@ def automatic_rig(
     """
     if views is not None and views < 1:
         raise InputError(f"{views} automatic views: expected at least 1")
-    scene = gather_witnesses(source)
+    scene = sample_scene(source)
     focal = width / 2 / math.tan(FIELD_OF_VIEW / 2)
     frames = Frames(DIRECTIONS, math.atan(math.sqrt(width * height / math.pi) / focal))
     share = math.sqrt(max(1.0, source.count / USUAL_COUNT))
@@ -128,7 +128,7 @@ def automatic_rig(
     return Rig(cameras, near, f"{_placed(scene, at)}{hidden}; {found.note}")
 
 
-def _blind(scene: Witnesses) -> Candidate:
+def _blind(scene: SceneSample) -> Candidate:
     """A view of a scene of which nothing can be drawn."""
     whole, none = scene.whole, np.zeros(0)
     at = whole.middle - np.array([0.0, 0.0, 3 * whole.extent])
@@ -137,7 +137,7 @@ def _blind(scene: Witnesses) -> Candidate:
     )
 
 
-def _placed(scene: Witnesses, places: np.ndarray) -> str:
+def _placed(scene: SceneSample, places: np.ndarray) -> str:
     whole = scene.whole
     inside = float(np.mean(np.all(np.abs(places - whole.middle[:, None]) < whole.half[:, None], axis=0)))
     kind = "inside out" if inside > 0.75 else "from outside" if inside < 0.25 else "from inside and outside"

@@ -11,7 +11,7 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.detail import UNITS as LOGS
 from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
-from flexgs_edge.cameras.witnesses import Witnesses
+from flexgs_edge.cameras.scene_sample import SceneSample
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 
 MOST_VIEWS = 400
@@ -108,7 +108,7 @@ class Candidate:
 class Stage:
     """Candidates with all that is known of them."""
 
-    def __init__(self, scene: Witnesses, show: Show, frames: Frames, lens: float) -> None:
+    def __init__(self, scene: SceneSample, show: Show, frames: Frames, lens: float) -> None:
         self.scene, self.frames = scene, frames
         self._show, self._focal = show, SIDE * lens
         self.views: list[Candidate] = []

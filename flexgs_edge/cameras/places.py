@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flexgs_edge.cameras.directions import fibonacci
-from flexgs_edge.cameras.witnesses import Part, Witnesses
+from flexgs_edge.cameras.scene_sample import Part, SceneSample
 
 MARGIN = 1.2
 """A lattice reaches so many half sides of its box to each side."""
@@ -25,7 +25,7 @@ SPARSE = 0.5
 """A scene is sparse if all its cross-sections together are less than this share of a circle around its box."""
 
 
-def first_places(scene: Witnesses, count: int) -> tuple[np.ndarray, np.ndarray]:
+def first_places(scene: SceneSample, count: int) -> tuple[np.ndarray, np.ndarray]:
     """About `count` candidates in and around the parts of a scene.
 
     Returns
@@ -42,7 +42,7 @@ def first_places(scene: Witnesses, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([at for at, _ in found], axis=1), np.concatenate([step for _, step in found])
 
 
-def is_sparse(scene: Witnesses) -> bool:
+def is_sparse(scene: SceneSample) -> bool:
     """Say if a view of the whole scene would be almost empty."""
     return scene.area < SPARSE * scene.whole.extent**2
 
@@ -69,7 +69,7 @@ def _lattice(box: Part, count: float) -> tuple[np.ndarray, np.ndarray]:
     return at, np.full(at.shape[1], step)
 
 
-def _close_ups(scene: Witnesses) -> tuple[np.ndarray, np.ndarray]:
+def _close_ups(scene: SceneSample) -> tuple[np.ndarray, np.ndarray]:
     """Places around the splats that show most."""
     order = np.argsort(-scene.sample.opacity * scene.sample.sizes**2, kind="stable")[:CLOSE_UPS]
     distances = CLOSE_DISTANCE * scene.sample.sizes[order]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexgs_edge.cameras.directions import Frames, bins_of
-from flexgs_edge.cameras.witnesses import Splats, Witnesses
+from flexgs_edge.cameras.scene_sample import SceneSample, Splats
 
 CONVENTION = (0.0, -1.0, 0.0)
 """Up in COLMAP's frame."""
@@ -101,7 +101,7 @@ class Stands:
     forward: np.ndarray
 
 
-def find_up(scene: Witnesses, stands: Stands) -> Up:
+def find_up(scene: SceneSample, stands: Stands) -> Up:
     """The direction of up: from the ground, the ring of cameras, or the convention."""
     told = scene.share >= RING_TELLING
     ring = _ring(stands) if told else None

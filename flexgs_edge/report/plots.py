@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import io
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from flexgs_edge.errors import InputError
 
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-INCHES, TALL, DPI = (7.2, 4.4), (7.2, 6.2), 144
+DPI = 144
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#A0A000")
-GREY, INK = "#7a7a7a", "#222222"
+INK = "#222222"
 SHORT = 8  # Notes shorter than this many letters are centred over their point
-MARKS, OPEN_MARKS = ("o", "s", "^", "D", "v", "P", "<", ">"), ("*", "d")
+MARKS = ("o", "s", "^", "D", "v", "P", "<", ">")
 LINEAR_BELOW = 0.1
 LEVELS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _STYLE: dict[Any, Any] = {
@@ -55,7 +56,6 @@ class Series:
     x: Sequence[float]
     y: Sequence[float | None]
     line: bool = True  # join the points by a line
-    published: bool = False  # the figures come from the paper and not from this run: draw grey, open marks
     notes: Sequence[str] = ()  # text beside each point
     # x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the
     # chart.
@@ -63,13 +63,21 @@ class Series:
 
 
 @dataclass(frozen=True)
-class LineChart:
-    """Curves over a common axis.
-
-    `log_x`, `log_y`: use a plain log scale, such as for times. All values must be above zero.
-    """
+class Chart(ABC):
+    """What to draw."""
 
     title: str
+    inches: ClassVar[tuple[float, float]] = (7.2, 4.4)
+
+    @abstractmethod
+    def draw(self, axes: Axes) -> None:
+        """Draw it with matplotlib, without its title."""
+
+
+@dataclass(frozen=True)
+class LineChart(Chart):
+    """Curves over a common axis."""
+
     x_label: str
     y_label: str
     series: tuple[Series, ...]
@@ -77,58 +85,27 @@ class LineChart:
     doublings: bool = False  # show x in powers of two
     # Show y on a log scale that is linear below `LINEAR_BELOW`, for losses below and far above 1 dB in one chart.
     magnitudes: bool = False
-    megabytes: bool = False  # show x in MB, on a log scale
     floating: bool = False  # y need not start at zero, such as for fidelity
-    log_x: bool = False
-    log_y: bool = False
+    log_x: bool = False  # a plain log scale, such as for times and bytes: all values must be above zero
     # Pareto front: points that no other point beats, joined by steps under the series.
     front: Sequence[tuple[float, float]] = ()
 
+    def draw(self, axes: Axes) -> None:
+        _lines(axes, self)
+
 
 @dataclass(frozen=True)
-class BarChart:
+class BarChart(Chart):
     """Grouped bars from zero, each with its value."""
 
-    title: str
     y_label: str
     groups: Sequence[str]  # along the axis
     bars: dict[str, Sequence[float | None]]  # one value per group, by label
     digits: int = 2
     limit: float | None = None  # mark this level with a line, and bars above it with a cross
 
-
-@dataclass(frozen=True)
-class DotChart:
-    """Grouped dots on a log axis with text beside them, for values of many magnitudes."""
-
-    title: str
-    y_label: str
-    groups: Sequence[str]  # along the axis
-    # One value per group, by label. Values of zero or below stand at the bottom as "none". None is left out.
-    dots: dict[str, Sequence[float | None]]
-    words: dict[str, Sequence[str]]  # text beside each dot, arranged as `dots`
-
-
-@dataclass(frozen=True)
-class PlaneChart:
-    """A grid of cells over the prune rate and the SH rate, with lines and points on it."""
-
-    title: str
-    x_label: str
-    y_label: str
-    colour_label: str
-    cells: dict[tuple[float, float], float]  # value of each cell, by its centre (x, y)
-    step: float  # side of a cell
-    top: float  # values from here up share the last colour
-    frontier: Sequence[tuple[float, float]]  # line on which the limit is reached
-    frontier_label: str
-    marked: Sequence[tuple[float, float]]  # cells to mark with a dot: the paper's candidates
-    # Points that a search visited, in order. The last one is its result.
-    path: Sequence[tuple[float, float]] = field(default=())
-    answer: tuple[float, float] | None = None
-
-
-Chart = LineChart | BarChart | DotChart | PlaneChart
+    def draw(self, axes: Axes) -> None:
+        _bars(axes, self)
 
 
 def require_matplotlib() -> None:
@@ -157,17 +134,10 @@ def draw(chart: Chart) -> Figure:
     """Draw the chart as a matplotlib figure, without pyplot: no windows and no global state."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=TALL if isinstance(chart, PlaneChart) else INCHES, layout="constrained")
+    figure = Figure(figsize=chart.inches, layout="constrained")
     axes = figure.add_subplot()
     axes.set_title(chart.title, loc="left")
-    if isinstance(chart, LineChart):
-        _lines(axes, chart)
-    elif isinstance(chart, BarChart):
-        _bars(axes, chart)
-    elif isinstance(chart, DotChart):
-        _dots(axes, chart)
-    else:
-        _plane(figure, axes, chart)
+    chart.draw(axes)
     return figure
 
 
@@ -175,36 +145,26 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     from matplotlib.patheffects import withStroke
     from matplotlib.ticker import LogLocator, NullLocator
 
-    own = others = 0
     xs = [x for series in chart.series for x in series.x]
-    logarithmic = chart.megabytes or chart.log_x
-    scale = math.log2 if chart.doublings or logarithmic else float
+    scale = math.log2 if chart.doublings or chart.log_x else float
     middle = (scale(min(xs)) + scale(max(xs))) / 2
-    for series in chart.series:
+    for place, series in enumerate(chart.series):
+        colour, mark = COLOURS[place], MARKS[place]
         points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
-        if series.published:
-            style: dict[str, Any] = {
-                "color": GREY,
-                "marker": OPEN_MARKS[others],
-                "markerfacecolor": "white",
-                "markersize": 9,
-            }
-            others += 1
-        else:
-            style = {"color": COLOURS[own], "marker": MARKS[own], "markersize": 5}
-            own += 1
         axes.plot(
             [x for x, _, _ in points],
             [y for _, y, _ in points],
             linestyle="-" if series.line else "",
             linewidth=1.5,
             label=series.label,
-            zorder=2 if series.published else 3,
+            color=colour,
+            marker=mark,
+            markersize=5,
+            zorder=3,
             clip_on=False,  # show marks at zero whole
-            **style,
         )
-        for place in series.broken:
-            _cross(axes, place, next((y for x, y, _ in points if x == place), None), style["color"])
+        for broken in series.broken:
+            _cross(axes, broken, next((y for x, y, _ in points if x == broken), None), colour)
         for x, y, i in points:
             if series.notes:
                 words = series.notes[i]
@@ -220,14 +180,14 @@ def _lines(axes: Axes, chart: LineChart) -> None:
     if chart.doublings:
         axes.set_xscale("log", base=2)
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
-    if logarithmic:
+    if chart.log_x:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
     if chart.front:
         steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
-        axes.step(*_split(sorted(chart.front)), where="post", label="Pareto front", **steps)
+        axes.step(*coordinates(sorted(chart.front)), where="post", label="Pareto front", **steps)
     # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
     shown = [y for series in chart.series for y in series.y if y is not None]
     low, high = min(shown, default=0.0), max(shown, default=1.0)
@@ -237,12 +197,7 @@ def _lines(axes: Axes, chart: LineChart) -> None:
         axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
         axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
         axes.yaxis.set_minor_locator(NullLocator())
-    if chart.log_y:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-        axes.yaxis.set_minor_locator(NullLocator())
-    elif not chart.floating:
+    if not chart.floating:
         axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
@@ -256,28 +211,6 @@ def _cross(axes: Axes, x: float, y: float | None, colour: str) -> None:
         axes.plot([x], [0.98], "x", transform=axes.get_xaxis_transform(), **cross)
     else:
         axes.plot([x], [y], "x", **cross)
-
-
-def _dots(axes: Axes, chart: DotChart) -> None:
-    axes.set_yscale("log")
-    shown = [value for values in chart.dots.values() for value in values if value is not None and value > 0]
-    axes.set_ylim(min(shown, default=1.0) / 4, max(shown, default=1.0) * 4)
-    foot = axes.get_ylim()[0]
-    width = 0.5 / len(chart.dots)
-    for number, (label, values) in enumerate(chart.dots.items()):
-        x = [group + (number + 0.5) * width - 0.4 for group in range(len(chart.groups))]
-        points = [(at, value) for at, value in zip(x, values) if value is not None and value > 0]
-        axes.plot(*_split(points), MARKS[number], color=COLOURS[number], markersize=7, label=label)
-        for at, value, words in zip(x, values, chart.words[label]):
-            if value is None:
-                continue
-            place = (at, value) if value > 0 else (at, foot)
-            text = words if value > 0 else f"none: {words}"
-            axes.annotate(text, place, (6, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set_xticks(range(len(chart.groups)), chart.groups)
-    axes.set_xlim(-0.6, len(chart.groups) - 0.4)
-    axes.set_ylabel(chart.y_label)
-    axes.legend()
 
 
 def _bars(axes: Axes, chart: BarChart) -> None:
@@ -305,37 +238,6 @@ def _bar_words(value: float | None, chart: BarChart) -> str:
     return ("\N{MULTIPLICATION SIGN}\n" if beyond else "") + f"{value:.{chart.digits}f}"
 
 
-def _plane(figure: Figure, axes: Axes, chart: PlaneChart) -> None:
-    from matplotlib import colormaps
-    from matplotlib.colors import Normalize
-    from matplotlib.patches import Rectangle
-
-    colours, scale = colormaps["cividis_r"], Normalize(0.0, chart.top)
-    half = chart.step / 2
-    for (x, y), value in chart.cells.items():
-        colour = colours(scale(value))
-        axes.add_patch(Rectangle((x - half, y - half), chart.step, chart.step, facecolor=colour, edgecolor="white"))
-        dark = sum(colour[:3]) < 1.5
-        axes.annotate(
-            f"{value:.2f}", (x, y - half * 0.75), ha="center", fontsize=6.5, color="white" if dark else INK, zorder=4
-        )
-    axes.plot(*_split(chart.marked), "o", color="white", markeredgecolor=INK, markersize=5, label="paper's candidates")
-    axes.plot(*_split(chart.frontier), "-", color=INK, linewidth=2.2, label=chart.frontier_label)
-    axes.plot(*_split(chart.path), "-", color=COLOURS[1], linewidth=1.0, marker=".", markersize=5, label="search")
-    if chart.answer is not None:
-        axes.plot(*chart.answer, "*", color=COLOURS[1], markeredgecolor="white", markersize=14, label="its answer")
-    xs, ys = [x for x, _ in chart.cells], [y for _, y in chart.cells]
-    axes.set_xlim(min(xs) - half, max(xs) + half)
-    axes.set_ylim(min(ys) - half, max(ys) + half)
-    axes.set_aspect("equal")
-    axes.grid(visible=False)
-    axes.set_xlabel(chart.x_label)
-    axes.set_ylabel(chart.y_label)
-    axes.legend(loc="upper right")
-    from matplotlib.cm import ScalarMappable
-
-    figure.colorbar(ScalarMappable(scale, colours), ax=axes, label=chart.colour_label, extend="max", shrink=0.85)
-
-
-def _split(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+def coordinates(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    """The x and the y of some points."""
     return [x for x, _ in points], [y for _, y in points]

@@ -14,7 +14,7 @@ from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, split_views
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cameras.witnesses import READ_ROWS
+from flexgs_edge.cameras.scene_sample import READ_ROWS
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget

@@ -4,16 +4,37 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from flexgs_edge.goals.target import Measurement
+from flexgs_edge.report.as_json import rounded
 from flexgs_edge.report.html import count
 from flexgs_edge.report.plots import Chart
 
 Cell = str | int | float | bool | None
 Row = Mapping[str, Cell]
+
+FIGURES = {
+    "size": "bytes",
+    "ratio": "ratio to PLY",
+    "drop": "drop (dB)",
+    "fidelity": "fidelity (dB)",
+    "modelled_drop": "modelled drop (dB)",
+}
+"""Columns of every measured file, and their heads."""
+
+
+def figures(size: int, ply_bytes: int, found: Measurement) -> dict[str, Cell]:
+    """Cells of the columns `FIGURES`: bytes, and quality in the figures that decide."""
+    return {
+        "size": size,
+        "ratio": round(ply_bytes / size, 3),
+        "drop": rounded(found.drop),
+        "fidelity": rounded(found.figure("fidelity")),
+        "modelled_drop": rounded(found.figure("modelled drop")),
+    }
 
 
 @dataclass(frozen=True)
@@ -52,18 +73,9 @@ class Table:
         writer.writerows(map(_csv_cell, row.values()) for row in self.rows)
         return text.getvalue().encode()
 
-    def to_json(self) -> list[dict[str, Cell]]:
-        """The rows as dicts."""
-        return [dict(row) for row in self.rows]
-
     def words(self) -> list[list[str]]:
         """The rows' cells as people read them."""
         return [[_words(cell) for cell in row.values()] for row in self.rows]
-
-
-def json_bytes(record: Any) -> bytes:
-    """A record as JSON text; raises `ValueError` for NaN and infinity."""
-    return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
 
 
 def columns(**heads: str) -> tuple[Column, ...]:
@@ -71,9 +83,11 @@ def columns(**heads: str) -> tuple[Column, ...]:
     return tuple(Column(name, head) for name, head in heads.items())
 
 
-def mean(values: Sequence[float]) -> float:
-    """Mean of at least one number."""
-    return sum(values) / len(values)
+def number(row: Row, column: str) -> float:
+    """The number in a cell."""
+    value = row[column]
+    assert isinstance(value, (int, float)), f"{column}: {value!r}"
+    return float(value)
 
 
 def _csv_cell(cell: Cell) -> str:
@@ -95,15 +109,6 @@ def _words(cell: Cell) -> str:
 
 
 @dataclass(frozen=True)
-class Beside:
-    """A figure measured here beside the published one."""
-
-    what: str
-    here: str
-    paper: str
-
-
-@dataclass(frozen=True)
 class Experiment:
     """One experiment on one scene."""
 
@@ -113,7 +118,6 @@ class Experiment:
     table: Table  # the measurements
     chart: Chart  # a chart of the table's rows
     findings: tuple[str, ...]  # sentences made from the table's numbers
-    beside: tuple[Beside, ...] = ()  # figures of the FlexGaussian paper, if it gives some
     timed: bool = False  # whether the table holds times, so that it differs from run to run
 
     def to_json(self) -> dict[str, Any]:
@@ -124,7 +128,6 @@ class Experiment:
             "question": self.question,
             "timed": self.timed,
             "columns": {column.name: column.head for column in self.table.columns},
-            "rows": self.table.to_json(),
+            "rows": [dict(row) for row in self.table.rows],
             "findings": list(self.findings),
-            "beside_the_paper": [{"what": b.what, "here": b.here, "paper": b.paper} for b in self.beside],
         }

@@ -18,7 +18,7 @@ from flexgs_edge.cameras.candidates import look
 from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cameras.witnesses import sh_basis, weighted_quantiles
+from flexgs_edge.cameras.scene_sample import sh_basis, weighted_quantiles
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.ply import PlySource

@@ -9,7 +9,7 @@ import pytest
 
 from flexgs_edge.cameras.detail import UNITS, WIDEST, few_rows, smears
 from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
-from flexgs_edge.cameras.witnesses import DRAWN_ROWS, find_parts, gather_witnesses
+from flexgs_edge.cameras.scene_sample import DRAWN_ROWS, find_parts, sample_scene
 from synthetic import make_splats
 
 
@@ -46,7 +46,7 @@ def test_few_rows_cover_as_much_as_all() -> None:
 
 def test_a_large_scene_is_drawn_in_few_rows() -> None:
     count = 3 * DRAWN_ROWS
-    scene = gather_witnesses(make_splats(ball(count), np.full((count, 3), 0.02)))
+    scene = sample_scene(make_splats(ball(count), np.full((count, 3), 0.02)))
     np.testing.assert_allclose(scene.whole.middle, 0, atol=0.1)
     assert scene.planes["means"].shape[1] == scene.sizes.size <= DRAWN_ROWS
     assert scene.stands.sum() == pytest.approx(count, rel=0.05)

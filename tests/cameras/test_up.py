@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.auto import automatic_rig
+from flexgs_edge.cameras.scene_sample import sample_scene, sh_basis
 from flexgs_edge.cameras.up import Stands, find_up
-from flexgs_edge.cameras.witnesses import gather_witnesses, sh_basis
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -165,7 +165,7 @@ def test_weak_evidence_changes_nothing(source: MemorySource, why: str) -> None:
 
 
 def test_a_wall_that_all_views_face_is_no_ground() -> None:
-    scene = gather_witnesses(seen_from_a_ring((0, 0, 1)))
+    scene = sample_scene(seen_from_a_ring((0, 0, 1)))
     rng = np.random.default_rng(0)
     at = np.stack([*rng.uniform(-3, 3, (2, 50)), np.full(50, -5.0)])
     frontal = Stands(at, np.ones(50), np.repeat([[0.1], [0.0], [0.99]], 20, axis=1))

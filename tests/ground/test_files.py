@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.files import atomic_folder, atomic_write, check_writable
 
 
 def test_the_file_appears_when_complete(tmp_path: Path) -> None:
@@ -107,3 +107,25 @@ def test_a_name_as_long_as_the_file_system_allows(tmp_path: Path) -> None:
     assert target.exists()
     with pytest.raises(InputError, match="cannot write there"), atomic_write(tmp_path / ("n" * 256)):
         pass
+
+
+def test_a_folder_that_is_empty_needs_no_force(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with atomic_folder(tmp_path / "out") as place:
+        (place / "a.csv").write_text("a")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
+
+
+def test_a_forced_folder_keeps_files_of_other_names(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "fox").mkdir(parents=True)
+    (out / "fox" / "a.csv").write_text("old")
+    (out / "notes.txt").write_text("mine")
+    with atomic_folder(out, force=True) as place:
+        (place / "fox").mkdir()
+        (place / "fox" / "a.csv").write_text("new")
+        (place / "index.html").write_text("page")
+        assert (out / "fox" / "a.csv").read_text() == "old"
+    assert (out / "fox" / "a.csv").read_text() == "new" and (out / "notes.txt").read_text() == "mine"
+    assert sorted(path.name for path in out.iterdir()) == ["fox", "index.html", "notes.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

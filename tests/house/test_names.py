@@ -16,12 +16,12 @@ DEFINING = ("kernels/twins/__init__.py",)
 FACE = "__init__.py"
 """The package's own face may have what loads its names when they are first used."""
 LAZY = {"_HOMES", "__getattr__", "__dir__", "__all__"}
-# Places that answer one question: a command and its options, two versions of the file, every method, every study.
+# Places that answer one question: a command or a study and its options, two versions of the file, every method.
 ALIKE = (
     {"commands", "cli"},
     {"codec/v1", "codec/v2"},
     {"methods/best", "methods/foreign", "methods/paper"},
-    {"studies/paper", "studies/rate", "studies/speed", "studies/stability"},
+    {"studies", "cli/study"},
 )
 SHARED = {"header": "codec"}
 """Names that a further folder may have: what the headers of both versions share."""

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from flexgs_edge.cameras.witnesses import sh_basis
+from flexgs_edge.cameras.scene_sample import sh_basis
 from flexgs_edge.constants import SH_C4
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame, FrameSource, in_frame

@@ -10,7 +10,7 @@ import pytest
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import BarChart, LineChart, Series, draw
-from flexgs_edge.studies.stability import unseen_poses
+from flexgs_edge.studies import stability
 from flexgs_edge.views.depths import visible_depths
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats
@@ -35,7 +35,7 @@ def test_other_poses_look_at_the_same_point() -> None:
     def seen(pose: object) -> np.ndarray:
         return pose.rotation @ point + pose.translation  # type: ignore[attr-defined]
 
-    turned = unseen_poses.above(camera, depth, 30.0)
+    turned = stability.above(camera, depth, 30.0)
     np.testing.assert_allclose(seen(turned), [0, 0, depth], atol=1e-12)
     assert math.degrees(math.acos(turned.rotation[2] @ camera.rotation[2])) == pytest.approx(30.0)
     # Above: the image's down component of the way there is negative.
@@ -53,5 +53,5 @@ def test_depth_of_what_is_seen_and_not_of_what_it_hides() -> None:
 def test_the_worst_tile() -> None:
     image, reference = np.zeros((100, 70, 3), np.float32), np.zeros((100, 70, 3), np.float32)
     image[70:, 66:] = 0.5  # wholly inside the tile at the corner, 36 x 6 pixels of it
-    assert unseen_poses.worst_tile(image, reference) == pytest.approx(0.25 * (30 * 4) / (36 * 6))
-    assert unseen_poses.worst_tile(image, reference, side=1000) == pytest.approx(mse(image, reference))
+    assert stability.worst_tile(image, reference) == pytest.approx(0.25 * (30 * 4) / (36 * 6))
+    assert stability.worst_tile(image, reference, side=1000) == pytest.approx(mse(image, reference))

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,23 +15,20 @@ import pytest
 from flexgs_edge.cli import app
 from flexgs_edge.cli.study.rate import RATIOS, command
 from flexgs_edge.commands.compress import compress
+from flexgs_edge.commands.decompress import decompress
+from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.target import min_ratio
-from flexgs_edge.io.exchange import read_foreign, write_foreign
-from flexgs_edge.progress import SILENT
 from flexgs_edge.report.plots import LineChart, Series, draw, picture
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.rate import study as rate
-from flexgs_edge.studies.rate.points import best_points, paper_points
-from flexgs_edge.studies.rate.study import RateStudy, study_rate
-from flexgs_edge.studies.rate.trade import Curve
-from flexgs_edge.studies.study_scene import StudyScene, open_study_scene
+from flexgs_edge.studies import rate
+from flexgs_edge.studies.rate import Curve, study_rate
+from flexgs_edge.studies.written import Study
 from tiny_project import COUNT, make_project
 
 pytestmark = pytest.mark.usefixtures("short_searches")
 
 OPTIONS = CompressOptions(method="best", holdout=4, effort="fast")
-RATIO = 3.0
+RATIO, BEYOND = 3.0, 5.0  # the paper's bits alone reach the first
 
 
 @pytest.fixture(scope="module")
@@ -41,70 +37,43 @@ def project(short_searches: None, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(scope="module")
-def studied(project: Path) -> Iterator[StudyScene]:
-    with open_study_scene(project / "point_cloud.ply", "cloud", OPTIONS, SILENT) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RateStudy, Path]:
+def study(project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Path]:
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
         # One format of another program: the others go the same way.
-        patch.setattr("flexgs_edge.studies.rate.points.PEERS", (".spz",))
-        found = study_rate(project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO])
+        patch.setattr("flexgs_edge.studies.rate.PEERS", (".spz",))
+        found = study_rate(project / "point_cloud.ply", out, OPTIONS, ratios=[RATIO, BEYOND, 1000.0])
     return found, out
 
 
-def rows_of(study: tuple[RateStudy, Path], key: str) -> list[dict[str, object]]:
+def rows_of(study: tuple[Study, Path], key: str) -> list[dict[str, object]]:
     return json.loads((study[1] / f"{key}.json").read_text())["rows"]
 
 
-def test_points_are_those_of_compress(study: tuple[RateStudy, Path], project: Path) -> None:
+def test_points_are_those_of_compress_and_evaluate(study: tuple[Study, Path], project: Path, tmp_path: Path) -> None:
     rows = rows_of(study, "rate")
-    # The first point of a curve starts from a path of its own, as a run of `compress` does.
-    for method, variant in (("best", "whole"), ("paper", "nothing pruned")):
-        words = {"min_ratio": RATIO} if method == "best" else {"prune_rate": 0.0, "sh_rate": 0.0}
-        made = compress(
-            project / "point_cloud.ply", None, replace(OPTIONS, method=method, promise="mean", **words), dry_run=True
-        )
-        (row,) = (r for r in rows if (r["method"], r["variant"]) == (method, variant))
+    assert [(row["method"], row["wanted_ratio"]) for row in rows] == [
+        ("best", RATIO), ("best", BEYOND), ("paper", None), ("paper", BEYOND), ("spz", None),
+    ]  # fmt: skip
+    for row in rows[1], rows[2]:
+        words = {"min_ratio": BEYOND} if row["method"] == "best" else {"prune_rate": 0.0, "sh_rate": 0.0}
+        options = replace(OPTIONS, method=str(row["method"]), promise="mean", **words)
+        made = compress(project / "point_cloud.ply", None, options, dry_run=True)
         assert (row["size"], row["kept"]) == (made.size, made.count)
         assert made.quality is not None
-        assert row["drop"] == pytest.approx(made.quality.drop, abs=1e-4)
+        assert row["drop"] == pytest.approx(made.quality.usual_drop, abs=1e-4)
         assert row["psnr"] == pytest.approx(made.quality.psnr, abs=1e-4)
         assert row["ssim"] == pytest.approx(made.quality.ssim_photo, abs=1e-5)
         assert row["flip"] == pytest.approx(made.quality.flip_photo, abs=1e-5)
         assert row["bits"] == pytest.approx(8 * made.size / made.count, abs=0.01)
+    assert all(float(str(row["ratio"])) >= float(str(row["wanted_ratio"])) for row in rows if row["wanted_ratio"])
+    decompress(project / "point_cloud.ply", tmp_path / "a.spz", cameras="none")
+    found = evaluate(tmp_path / "a.spz", project / "point_cloud.ply", OPTIONS)
+    assert rows[4]["kept"] == COUNT and rows[4]["size"] == (tmp_path / "a.spz").stat().st_size
+    assert rows[4]["fidelity"] == pytest.approx(found.quality.fidelity, abs=1e-4)
 
 
-def test_paper_searches_every_ratio_that_its_bits_alone_miss(studied: StudyScene) -> None:
-    least, *others = paper_points(studied, [2.0, 5.0, 6.0]).points
-    assert (least.variant, least.kept) == ("nothing pruned", COUNT) and studied.run.scene.ply_bytes / least.size > 2
-    assert [point.wanted for point in others] == [5.0, 6.0]
-    assert all(studied.run.scene.ply_bytes / point.size >= (point.wanted or 0) for point in others)
-    assert others[0].size == studied.adapt(min_ratio(5.0, studied.run.scene.ply_bytes, "drop")).chosen.size
-
-
-def test_points_keep_to_the_ratio(study: tuple[RateStudy, Path]) -> None:
-    rows = [row for row in rows_of(study, "rate") if row["method"] == "best"]
-    assert [(row["variant"], row["effort"]) for row in rows] == [("whole", "fast")]
-    assert all(float(str(row["ratio"])) >= RATIO for row in rows)
-
-
-def test_another_format_holds_the_whole_scene(
-    study: tuple[RateStudy, Path], project: Path, studied: StudyScene, tmp_path: Path
-) -> None:
-    (row,) = (row for row in rows_of(study, "rate") if row["method"] == "spz")
-    assert row["kept"] == COUNT
-    # Rows in another order than the study's: other bytes, the same values.
-    write_foreign(tmp_path / "a.spz", studied.run.source)
-    with studied.context.renderer.load(read_foreign(tmp_path / "a.spz")) as scene:
-        found = studied.judge.compare(scene)
-    assert row["fidelity"] == pytest.approx(found.fidelity, abs=0.2)
-
-
-def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> None:
+def test_csv_page_and_charts_hold_the_same(study: tuple[Study, Path]) -> None:
     result, out = study
     keys = ["rate", "fidelity"]
     assert [experiment.key for experiment in result.scene.experiments] == keys
@@ -117,9 +86,10 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[RateStudy, Path]) -> Non
     assert isinstance(chart, LineChart)
     drawn = {series.label: [round(1e6 * x) for x in series.x] for series in chart.series}
     rows = rows_of(study, "rate")
-    assert drawn["best"] == [row["size"] for row in rows if row["method"] == "best" and row["variant"] == "whole"]
-    assert drawn["paper"] == [row["size"] for row in rows if row["method"] == "paper"]
-    assert "Left out or not reached" not in result.to_text()
+    for method in drawn:
+        assert drawn[method] == [row["size"] for row in rows if row["method"] == method]
+    # A header of 2 kB is more than a thousandth of the scene.
+    assert "Left out or not reached: best at 1000x; paper at 1000x." in result.to_text()
 
 
 def test_without_photos(project: Path, tmp_path: Path) -> None:
@@ -130,25 +100,18 @@ def test_without_photos(project: Path, tmp_path: Path) -> None:
     assert set(experiment.table.values("method")) == {"best", "paper", "spz", "sog", "compressed.ply"}
 
 
-def test_a_ratio_out_of_reach_is_said(studied: StudyScene, project: Path) -> None:
-    # A header of 2 kB is more than a thousandth of the scene.
-    found = best_points(studied, "fast", [1000.0])
-    assert found.points == () and found.missing == ("best (fast) at 1000x",)
-
-
 def test_a_curve_reads_power_laws_and_ends_at_its_points() -> None:
     curve = Curve((size, 40 / size) for size in (400, 100, 200, 50))
-    assert curve.loss(150) == pytest.approx(40 / 150) and curve.size(0.16) == pytest.approx(250)
-    assert curve.loss(50) == pytest.approx(0.8) and curve.size(0.1) == pytest.approx(400)
-    assert curve.loss(49) is None and curve.loss(401) is None and curve.size(0.81) is None and curve.size(-0.1) is None
+    assert curve.size(0.16) == pytest.approx(250) and curve.size(0.1) == pytest.approx(400)
+    assert curve.size(0.81) is None and curve.size(-0.1) is None
     # The larger of two files is the worse one: nobody would take it.
     assert Curve([(100, 1.0), (200, 2.0), (400, 0.5)]).size(1.0) == pytest.approx(100)
-    assert Curve([]).size(1.0) is None and Curve([]).loss(1) is None
+    assert Curve([]).size(1.0) is None
 
 
 def test_a_chart_over_megabytes_has_a_log_axis_and_need_not_start_at_zero() -> None:
     series = (Series("best", [0.03, 0.5, 1.1], [38.0, 45.0, 51.0], notes=["256x", "", "8x"]),)
-    chart = LineChart("t", "MB", "dB", series, megabytes=True, floating=True)
+    chart = LineChart("t", "MB", "dB", series, log_x=True, floating=True)
     (axes,) = draw(chart).axes
     assert axes.get_xscale() == "log" and axes.get_ylim()[0] > 30
     assert {0.05, 0.1, 0.2, 0.5, 1.0} <= {round(float(tick), 6) for tick in axes.get_xticks()}
@@ -170,15 +133,15 @@ def test_ratios_are_checked_before_any_work(tmp_path: Path, words: dict[str, obj
 
 
 def test_the_command_line_hands_on_what_it_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], study: tuple[RateStudy, Path]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], study: tuple[Study, Path]
 ) -> None:
     told: dict[str, object] = {}
 
-    def told_study(scene: str, output: str, options: CompressOptions, progress: object, **words: object) -> RateStudy:
+    def told_study(scene: str, output: str, options: CompressOptions, progress: object, **words: object) -> Study:
         told.update(words, effort=options.effort, scene=scene)
         return study[0]
 
-    monkeypatch.setattr("flexgs_edge.studies.rate.study.study_rate", told_study)
+    monkeypatch.setattr("flexgs_edge.studies.rate.study_rate", told_study)
     words = ["study", "rate", "a.ply", "-o", str(tmp_path / "out"), "--ratios", "10,20", "-q"]
     with pytest.raises(SystemExit) as left:
         app.main([*words, "--json", "-"])

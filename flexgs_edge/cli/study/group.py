@@ -7,7 +7,6 @@ import click
 from flexgs_edge.cli.lazy_group import LazyGroup
 
 COMMANDS = {
-    "paper": "Repeat the FlexGaussian paper's experiments on your scenes.",
     "rate": "Chart bytes against quality for a scene.",
     "speed": "Chart the time of a run against the ratio that it finds.",
     "stability": "Find where methods break on a scene.",
@@ -23,9 +22,8 @@ def command() -> None:
 
     \b
     Examples:
-      flexgs-edge study paper point_cloud.ply -o study
       flexgs-edge study rate point_cloud.ply -o rate
       flexgs-edge study speed point_cloud.ply -o speed
       flexgs-edge study stability point_cloud.ply -o stability
-      flexgs-edge study paper --help
+      flexgs-edge study rate --help
     """

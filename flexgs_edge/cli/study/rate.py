@@ -62,7 +62,7 @@ def command(
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
-    from flexgs_edge.studies.rate.study import study_rate
+    from flexgs_edge.studies.rate import study_rate
 
     made = CompressOptions(**options)
     result = study_rate(scene, output, made, progress, ratios=ratios)

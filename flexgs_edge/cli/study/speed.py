@@ -27,7 +27,7 @@ def command(scene: str, output: str, json_path: str | None, quiet: bool, **optio
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
-    from flexgs_edge.studies.speed.study import study_speed
+    from flexgs_edge.studies.speed import study_speed
 
     result = study_speed(scene, output, CompressOptions(**options), progress)
     talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

@@ -22,7 +22,7 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
       heldout, distance,     the worst view; cameras nearer, farther, between
       poses                  and above the path; other lenses and sizes
 
-    Compares both methods with simple baselines: plain rounding, and removing Gaussians or SH alone. A method breaks where it
+    Compares best, best by the mean alone, and paper. A method breaks where it
     loses far too much PSNR. Results appear in DIR when all is done: open DIR/index.html.
 
     \b
@@ -33,7 +33,7 @@ def command(scene: str, output: str, quick: bool, json_path: str | None, quiet: 
     """
     progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
-    from flexgs_edge.studies.stability.study import study_stability
+    from flexgs_edge.studies.stability import study_stability
 
     result = study_stability(scene, output, CompressOptions(**options), progress, quick=quick)
     talk.emit(result.to_text(), result.to_json(), json_path, options["force"])

@@ -1,4 +1,4 @@
-"""A scene in small, for placing cameras: where its parts lie, and some of its Gaussians, which are drawn.
+"""A sample of a scene, for placing cameras: where its parts lie, and some of its Gaussians, which are drawn.
 
 All positions are relative to the source's origin.
 """
@@ -113,7 +113,7 @@ class Splats:
 
 
 @dataclass(frozen=True)
-class Witnesses:
+class SceneSample:
     """A scene in small.
 
     Attributes
@@ -171,7 +171,7 @@ class Witnesses:
         return strength
 
 
-def gather_witnesses(source: Gaussians) -> Witnesses:
+def sample_scene(source: Gaussians) -> SceneSample:
     """Look through a scene. Any with at least one Gaussian will do."""
     sample = Splats.read(source, np.arange(0, source.count, max(1, -(-source.count // SAMPLE_ROWS))))
     parts = find_parts(sample.means, sample.sizes, sample.opacity)
@@ -197,7 +197,7 @@ def gather_witnesses(source: Gaussians) -> Witnesses:
     raised = max(0.0, math.log(OPAQUE / (1 - OPAQUE)) - math.log(peak / max(1 - peak, 1e-300)))
     logits = np.clip(planes["opacity_logits"], -60, 60) + raised
     telling, sh, share = _directions(source, drawn * step)
-    return Witnesses(
+    return SceneSample(
         parts=parts,
         sample=sample,
         area=2 * step * float(np.rint(areas / max(float(areas.max()), 1e-300) * 2.0**24).sum() * areas.max() / 2.0**24),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,21 +11,15 @@ from typing import Any
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.plots import LineChart, Series
-from flexgs_edge.report.results import CompressResult, decided_words
+from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.studies.result_tables import Cell, Experiment, Table, columns
-from flexgs_edge.studies.study_scene import scene_names
-from flexgs_edge.studies.written import SceneStudy, WrittenStudy, write_study
+from flexgs_edge.run.quality_evaluator import measurement_of
+from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns, figures, number
+from flexgs_edge.studies.written import SceneStudy, Study, write_study
 
 LOG = logging.getLogger("flexgs_edge")
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
-
-
-class SpeedStudy(WrittenStudy):
-    """The results of `study speed`, and their folder."""
-
-    command = "study speed"
 
 
 def study_speed(
@@ -35,17 +28,21 @@ def study_speed(
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
     **words: Any,
-) -> SpeedStudy:
+) -> Study:
     """Measure the time and the ratio of every preset on a scene and write them to a folder.
 
     Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
     written then.
     """
     options = replace(options or CompressOptions(), **words)
-    found = write_study(
-        output, options.force, "Speed and accuracy", _INTRO, lambda folder: _study(scene, options, progress)
+    return write_study(
+        "study speed",
+        output,
+        options.force,
+        "Speed and accuracy",
+        _INTRO,
+        lambda folder: _study(scene, options, progress),
     )
-    return SpeedStudy(os.fspath(output), found)
 
 
 _INTRO = (
@@ -62,7 +59,7 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
         words = replace(options, method=method, effort=effort, dry_run=True, best_effort=True, report=None)
         found = compress(path, None, words, progress)
         rows.append(_row(method, effort, found))
-    best = front([float(row["seconds"] or 0) for row in rows], [float(row["ratio"] or 0) for row in rows])
+    best = front([number(row, "seconds") for row in rows], [number(row, "ratio") for row in rows])
     for row, on in zip(rows, best):
         row["front"] = on
     table = Table(
@@ -72,12 +69,8 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
             seconds="seconds",
             search_seconds="of them, search",
             steps="results measured",
-            size="bytes",
-            ratio="ratio to PLY",
+            **FIGURES,
             kept="Gaussians kept",
-            drop="drop (dB)",
-            fidelity="fidelity (dB)",
-            modelled_drop="modelled drop (dB)",
             reached="target met",
             front="on the front",
         ),
@@ -103,7 +96,7 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
                 for method in dict.fromkeys(str(row["method"]) for row in rows)
             ),
             log_x=True,
-            front=[(float(row["seconds"] or 0), float(row["ratio"] or 0)) for row in rows if row["front"]],
+            front=[(number(row, "seconds"), number(row, "ratio")) for row in rows if row["front"]],
         ),
         (
             "; ".join(
@@ -114,27 +107,19 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
         ),
         timed=True,
     )
-    assert found.views is not None
-    by = decided_words(found)
-    return SceneStudy(scene_names([path])[0], found.scene, found.views, by, (experiment,), found.run)
+    return SceneStudy.of(path, found, experiment)
 
 
 def _row(method: str, effort: str, found: CompressResult) -> dict[str, Cell]:
-    quality = found.quality
-    assert quality is not None
-    drop, fidelity = quality.drop, quality.fidelity
+    assert found.quality is not None
     return {
         "method": method,
         "effort": effort,
         "seconds": round(found.run.seconds - found.run.startup_seconds, 2),
         "search_seconds": round(found.run.stages.get("search", 0.0), 2),
         "steps": 0 if found.search is None else len(found.search.steps),
-        "size": found.size,
-        "ratio": round(found.ratio, 3),
+        **figures(found.size, found.scene.ply_bytes, measurement_of(found.quality)),
         "kept": found.count,
-        "drop": None if drop is None else round(drop, 4),
-        "fidelity": None if fidelity is None else round(fidelity, 4),
-        "modelled_drop": round(quality.modelled_drop, 4),
         "reached": found.reached,
     }
 

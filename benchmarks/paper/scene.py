@@ -28,7 +28,7 @@ from flexgs_edge.run.plan import EVERYTHING, Plan
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.studies.result_tables import Cell
+from flexgs_edge.studies.result_tables import Cell, figures
 from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
@@ -152,14 +152,8 @@ class StudyScene:
         return self._search
 
     def figures(self, size: int, found: Measurement) -> dict[str, Cell]:
-        """Cells of the columns `FIGURES`: bytes, and quality in the figures that decide."""
-        return {
-            "size": size,
-            "ratio": round(self.run.scene.ply_bytes / size, 3),
-            "drop": _decibel(found.drop),
-            "fidelity": _decibel(found.figure("fidelity")),
-            "modelled_drop": _decibel(found.figure("modelled drop")),
-        }
+        """Cells of the columns `FIGURES`."""
+        return figures(size, self.run.scene.ply_bytes, found)
 
     def cells(self, point: Point) -> dict[str, Cell]:
         """Cells of the columns `FIGURES` for a point."""
@@ -168,15 +162,6 @@ class StudyScene:
     def error(self, point: Point) -> float:
         """Mean squared error against the original's renders, averaged over the views."""
         return error_for_drop(point.measurement.modelled_drop, self.judge.base_psnr)
-
-
-FIGURES = {
-    "size": "bytes",
-    "ratio": "ratio to PLY",
-    "drop": "drop (dB)",
-    "fidelity": "fidelity (dB)",
-    "modelled_drop": "modelled drop (dB)",
-}  # Columns at the end of every measured row, and their heads
 
 
 class _Remembering:
@@ -235,25 +220,6 @@ def open_study_scene(
         yield StudyScene(name, run, context, judge, orders, has_sh)
 
 
-def scene_names(paths: Sequence[str | Path]) -> list[str]:
-    """A short, unique name for every scene: the file's name, or its folder's if the file is a `point_cloud`.
-
-    >>> scene_names(["a/fox/point_cloud.ply", "b/fox/point_cloud/iteration_7000/point_cloud.ply", "garden.fgs"])
-    ['fox', 'fox-2', 'garden']
-    """
-    names: list[str] = []
-    for path in paths:
-        place = Path(path).absolute()
-        parts = [part for part in place.parts[1:-1] if part != "point_cloud" and not part.startswith("iteration_")]
-        stem = place.name if place.is_dir() else place.name.split(".")[0]
-        base = parts[-1] if stem in ("point_cloud", "") and parts else stem
-        name, number = base, 1
-        while name in names:
-            number += 1
-            name = f"{base}-{number}"
-        names.append(name)
-    return names
-
-
-def _decibel(value: float | None) -> float | None:
-    return None if value is None else round(value, 4)
+def beside(what: str, here: str, paper: str) -> str:
+    """A figure measured here beside the published one, in words."""
+    return f"{what}: {here}; paper: {paper}"

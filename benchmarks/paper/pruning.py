@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.paper.charts import PlaneChart
+from benchmarks.paper.scene import Point, Setting, StudyScene, beside
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
-from flexgs_edge.report.plots import LineChart, PlaneChart, Series
-from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns, mean
-from flexgs_edge.studies.study_scene import FIGURES, Point, Setting, StudyScene
+from flexgs_edge.report.plots import LineChart, Series
+from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns, number
 
 DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.
 GRID = 100  # Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid.
@@ -101,15 +102,15 @@ def _wins(rows: Sequence[dict[str, Cell]], level: str, family: str, figure: str)
         if row["level"] == level and row["method"] == level:
             own = row
         elif row["level"] == level and row["method"] == family:
-            gaps.append(_number(row, figure) - _number(own, figure))
-            apart = max(apart, abs(_number(row, "size") / _number(own, "size") - 1))
+            gaps.append(number(row, figure) - number(own, figure))
+            apart = max(apart, abs(number(row, "size") / number(own, "size") - 1))
     if not gaps:
         return f"{level}: {family} reaches none of these sizes."
     better = sum(gap > 0 for gap in gaps)
     return (
         f"{level}: loses less than {family} at {better} of the {len(gaps)} sizes that both reach; {family} loses "
-        f"{mean(gaps):+.3f} dB more than ADP on average ({min(gaps):+.3f} to {max(gaps):+.3f}). Bytes differ by at most "
-        f"{100 * apart:.2f} %."
+        f"{sum(gaps) / len(gaps):+.3f} dB more than ADP on average ({min(gaps):+.3f} to {max(gaps):+.3f}). "
+        f"Bytes differ by at most {100 * apart:.2f} %."
     )
 
 
@@ -124,13 +125,11 @@ def plane(studied: StudyScene) -> Experiment:
         {"kind": "candidate" if choice in listed else "cell", "step": None, **_rates(choice), **studied.cells(point)}
         for choice, point in found.items()
     ]
-    for number, step in enumerate(search.steps, 1):
+    for turn, step in enumerate(search.steps, 1):
         assert step.measurement is not None
         # Steps of the list and of the refinement are estimates, because the search saw only these.
         kind = "answer" if step is search.chosen else step.phase
-        rows.append(
-            {"kind": kind, "step": number, **_rates(step.choice), **studied.figures(step.size, step.measurement)}
-        )
+        rows.append({"kind": kind, "step": turn, **_rates(step.choice), **studied.figures(step.size, step.measurement)})
     figure = studied.figure
     limit = getattr(studied.target, "limit", None)
     assert isinstance(limit, float)
@@ -160,7 +159,7 @@ def plane(studied: StudyScene) -> Experiment:
             "p: share of the Gaussians removed",
             "s: further share of Gaussians that lose their SH",
             FIGURES[figure],
-            {(_number(row, "prune_rate"), _number(row, "sh_rate")): _number(row, figure) for row in grid},
+            {(number(row, "prune_rate"), number(row, "sh_rate")): number(row, figure) for row in grid},
             GRID / 1000,
             2.0 * limit,
             frontier,
@@ -175,10 +174,8 @@ def plane(studied: StudyScene) -> Experiment:
             f"The search took {len(search.steps)} steps and chose p = {search.chosen.choice.prune / 1000:g}, "
             f"s = {search.chosen.choice.sh / 1000:g}: {answer['ratio']}x at {answer[figure]:.3f} dB"
             + ("." if search.reached else " (the target is NOT reached: this is the closest point)."),
-        ),
-        (
-            Beside("ratio at the search's answer", f"{answer['ratio']:.1f}x", "19.5x to 28x"),
-            Beside(
+            beside("ratio at the search's answer", f"{answer['ratio']:.1f}x", "19.5x to 28x"),
+            beside(
                 "smaller by, and loss there",
                 f"{100 * (1 - chosen.size / studied.run.scene.ply_bytes):.1f} %, {answer[figure]:.2f} dB",
                 "94.9 / 96.1 / 96.4 %, 0.87 / 0.86 / 0.85 dB (Mip-NeRF360 / Tanks&Temples / Deep Blending)",
@@ -268,8 +265,8 @@ def scores(studied: StudyScene) -> Experiment:
         ),
         (
             f"meson loses less at {sum(gap < 0 for gap in gaps)} of {len(gaps)} candidates; it loses "
-            f"{mean(gaps):+.3f} dB more than gs on average ({min(gaps):+.3f} to {max(gaps):+.3f}). The two scores share "
-            f"{100 * same:.0f} % of the lower half of the ranks.",
+            f"{sum(gaps) / len(gaps):+.3f} dB more than gs on average ({min(gaps):+.3f} to {max(gaps):+.3f}). "
+            f"The two scores share {100 * same:.0f} % of the lower half of the ranks.",
         ),
     )
 
@@ -282,11 +279,5 @@ def _loss(studied: StudyScene, point: Point) -> float:
     return point.measurement.loss(studied.plan.figure)
 
 
-def _number(row: dict[str, Cell], column: str) -> float:
-    value = row[column]
-    assert isinstance(value, (int, float)), f"{column}: {value!r}"
-    return value
-
-
 def _places(rows: object) -> list[tuple[float, float]]:
-    return [(_number(row, "prune_rate"), _number(row, "sh_rate")) for row in rows]  # type: ignore[attr-defined]
+    return [(number(row, "prune_rate"), number(row, "sh_rate")) for row in rows]  # type: ignore[attr-defined]

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.paper.pruning import RATES
+from benchmarks.paper.scene import Setting, StudyScene, beside
 from flexgs_edge.goals.steps import MAX_PRUNE, Choice
 from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
@@ -15,9 +17,7 @@ from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
-from flexgs_edge.studies.paper.pruning import RATES
-from flexgs_edge.studies.result_tables import Beside, Cell, Experiment, Table, columns
-from flexgs_edge.studies.study_scene import FIGURES, Setting, StudyScene
+from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)  # The strongest compression that the search may choose
@@ -132,8 +132,8 @@ def rates(studied: StudyScene) -> Experiment:
             FIGURES[figure],
             (
                 Series("here", table.values("ratio"), table.values(figure), notes=ends),
-                Series("the paper's curve: its two ends", [8.0, 256.0], [0.05, 9.0], line=False, published=True),
-                Series("the paper's means of three data sets", *PAPER_MEANS, line=False, published=True),
+                Series("the paper's curve: its two ends", [8.0, 256.0], [0.05, 9.0], line=False),
+                Series("the paper's means of three data sets", *PAPER_MEANS, line=False),
             ),
             limit=getattr(studied.target, "limit", None),
             doublings=True,
@@ -142,15 +142,16 @@ def rates(studied: StudyScene) -> Experiment:
         (
             f"The method reaches from {low['ratio']}x ({low[figure]:.3f} dB, nothing pruned) to {high['ratio']}x "
             f"({high[figure]:.3f} dB); not reached: {', '.join(f'{ratio}x' for ratio in missing) or 'none of those asked for'}.",
-        ),
-        tuple(
-            Beside(
-                f"loss where {ratio}x is asked for",
-                f"{table.values(figure, wanted_ratio=ratio)[0]:.2f} dB at {table.values('ratio', wanted_ratio=ratio)[0]:.0f}x",
-                paper,
-            )
-            for ratio, paper in ((8, "0.05 dB"), (256, "9 dB"))
-            if ratio in reached
+            *(
+                beside(
+                    f"loss where {ratio}x is asked for",
+                    f"{table.values(figure, wanted_ratio=ratio)[0]:.2f} dB at "
+                    f"{table.values('ratio', wanted_ratio=ratio)[0]:.0f}x",
+                    paper,
+                )
+                for ratio, paper in ((8, "0.05 dB"), (256, "9 dB"))
+                if ratio in reached
+            ),
         ),
     )
 
@@ -201,11 +202,9 @@ def times(studied: StudyScene) -> Experiment:
         (
             f"All stages of a compress run {whole:.1f} s, of which the search {stages['search']:.1f} s in {len(steps)} steps; "
             f"peak memory of the process {memory / 2**30:.2f} GiB.",
-        ),
-        (
-            Beside("whole run", f"{whole:.1f} s", "26 / 18 / 26 s on an RTX 3090, 59 to 135 s on a Jetson Xavier"),
-            Beside("one step of the search", f"{step:.2f} s", f"{PAPER_STEP_ALL} s"),
-            Beside(
+            beside("whole run", f"{whole:.1f} s", "26 / 18 / 26 s on an RTX 3090, 59 to 135 s on a Jetson Xavier"),
+            beside("one step of the search", f"{step:.2f} s", f"{PAPER_STEP_ALL} s"),
+            beside(
                 "peak memory",
                 f"{memory / 2**30:.2f} GiB for {source.count / 1e6:.2f} M Gaussians",
                 "6.75 GiB for 6.2 M, 21 GiB for 11.8 M",

@@ -1,32 +1,24 @@
-"""`study paper` on a tiny scene: numbers against independent computation, files against each other, errors before any work."""
+"""The paper's experiments on a tiny scene: numbers against independent computation."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
-import re
-import sys
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from markupsafe import escape
 from PIL import Image
 
+from benchmarks.paper import pruning, quantization, whole
+from benchmarks.paper.charts import PlaneChart
+from benchmarks.paper.scene import Setting, StudyScene, open_study_scene
+from benchmarks.paper.study import study_paper
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cli import app
-from flexgs_edge.cli.study.paper import command
 from flexgs_edge.codec.v1.header import container_size
 from flexgs_edge.commands.compress import compress
-from flexgs_edge.errors import InputError
-from flexgs_edge.files import atomic_folder, check_folder
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import MaxDrop
 from flexgs_edge.kernels.open_backend import open_backend
@@ -37,14 +29,11 @@ from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.packed.quantize import dequantize, quantize_scene
 from flexgs_edge.progress import SILENT
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.report.plots import BarChart, DotChart, LineChart, PlaneChart, picture
-from flexgs_edge.run.options import CompressOptions, ViewOptions
+from flexgs_edge.report.plots import picture
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.studies.paper import pruning, quantization, whole
-from flexgs_edge.studies.paper.study import EXPERIMENTS, PaperStudy, study_paper
-from flexgs_edge.studies.result_tables import Table, columns
-from flexgs_edge.studies.study_scene import Setting, StudyScene, open_study_scene, scene_names
+from flexgs_edge.studies.written import Study
 from tiny_project import COUNT, make_project
 
 # On the OpenCL device: hundreds of points are measured here, each seven times as fast as on the twins.
@@ -64,12 +53,12 @@ def studied(project: Path) -> Iterator[StudyScene]:
 
 
 @pytest.fixture(scope="module")
-def study(project: Path, studied: StudyScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[PaperStudy, Path]:
+def study(project: Path, studied: StudyScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Path]:
     out = tmp_path_factory.mktemp("written") / "out"
     with pytest.MonkeyPatch.context() as patch:
         # The study scene of the other tests, which has measured most points: a second one would double their time.
-        patch.setattr("flexgs_edge.studies.paper.study.open_study_scene", lambda *words, **more: nullcontext(studied))
-        return study_paper([project / "point_cloud.ply"], out, OPTIONS), out
+        patch.setattr("benchmarks.paper.study.open_study_scene", lambda *words, **more: nullcontext(studied))
+        return study_paper(project / "point_cloud.ply", out, OPTIONS), out
 
 
 def drop_of(studied: StudyScene, project: Path, scene: SceneSource) -> float:
@@ -268,56 +257,14 @@ def test_times_add_up(studied: StudyScene) -> None:
     assert values["peak memory"] > 2**24 and experiment.timed
 
 
-def test_csv_json_page_and_chart_say_the_same(study: tuple[PaperStudy, Path]) -> None:
-    result, out = study
-    page = (out / "index.html").read_text()
-    (scene,) = result.scenes
-    assert [experiment.key for experiment in scene.experiments] == [make.__name__ for make in EXPERIMENTS]
-    assert sorted(path.name for path in (out / "cloud").iterdir()) == sorted(
-        f"{experiment.key}.{suffix}" for experiment in scene.experiments for suffix in ("csv", "json", "png", "svg")
-    )
-    for experiment in scene.experiments:
-        place = out / "cloud" / experiment.key
-        record = json.loads(place.with_suffix(".json").read_text())
-        assert record["rows"] == experiment.table.to_json() and record["scene"] == "cloud"
-        lines = list(csv.DictReader(io.StringIO(place.with_suffix(".csv").read_text())))
-        assert len(lines) == len(record["rows"])
-        for line, row in zip(lines, record["rows"]):
-            assert list(line) == list(row)
-            for text, cell in zip(line.values(), row.values()):
-                known = "" if cell is None else cell
-                assert text == known if isinstance(known, str) else float(text) == known
-        with Image.open(place.with_suffix(".png")) as image:
-            assert image.format == "PNG" and image.width > 900
-        assert ElementTree.parse(place.with_suffix(".svg")).getroot().tag.endswith("svg")
-        shown = {cell for row in record["rows"] for cell in row.values() if isinstance(cell, (int, float))}
-        for value in chart_values(experiment.chart):
-            assert value in shown or any(math.isclose(value * 1e6, cell) for cell in shown), (experiment.key, value)
-    assert page.count("data:image/svg+xml;base64,") == len(scene.experiments)
-    assert not re.search(r'(src|href)="(?!data:|#)', page), "nothing is fetched"
-    assert all(str(escape(words)) in page for experiment in scene.experiments for words in experiment.findings)
-
-
-def chart_values(chart: object) -> list[float]:
-    """Every measured number that is drawn."""
-    if isinstance(chart, LineChart):
-        return [v for s in chart.series if not s.published for v in (*s.x, *s.y) if v is not None]
-    if isinstance(chart, BarChart):
-        return [v for label, values in chart.bars.items() if "paper (" not in label for v in values if v is not None]
-    if isinstance(chart, DotChart):
-        return [v for values in chart.dots.values() for v in values]
-    assert isinstance(chart, PlaneChart)
-    return [v for key, value in chart.cells.items() for v in (*key, value)] + [v for at in chart.frontier for v in at]
-
-
-def test_the_same_run_gives_the_same_bytes(project: Path, study: tuple[PaperStudy, Path], tmp_path: Path) -> None:
+def test_the_same_run_gives_the_same_bytes(project: Path, study: tuple[Study, Path], tmp_path: Path) -> None:
     # One experiment of every kind of chart.
     makers = (quantization.rtn, quantization.attributes, quantization.groups, pruning.plane)
-    again = study_paper([project / "point_cloud.ply"], tmp_path / "again", OPTIONS, experiments=makers)
-    assert len(again.scenes[0].experiments) == len(makers)
-    for experiment in again.scenes[0].experiments:
+    again = study_paper(project / "point_cloud.ply", tmp_path / "again", OPTIONS, experiments=makers)
+    assert len(again.scene.experiments) == len(makers)
+    for experiment in again.scene.experiments:
         for suffix in ("csv", "json", "png", "svg"):
-            name = f"cloud/{experiment.key}.{suffix}"
+            name = f"{experiment.key}.{suffix}"
             assert (tmp_path / "again" / name).read_bytes() == (study[1] / name).read_bytes(), name
 
 
@@ -336,7 +283,7 @@ def test_a_scene_without_held_out_views_or_sh(tmp_path: Path) -> None:
         assert "9 training views" in studied.decided_by
         found = {make.__name__: make(studied) for make in (quantization.attributes, pruning.splits, pruning.plane)}
     assert not studied.search.reached
-    assert "NOT reached" in found["plane"].findings[-1] and "no frontier" in found["plane"].findings[1]
+    assert "NOT reached" in found["plane"].findings[2] and "no frontier" in found["plane"].findings[1]
     assert "rest" not in found["attributes"].table.values("attribute")
     # No SH: removing Gaussians is all that ADP can do, and SH-P reaches no smaller file.
     assert "SH-P reaches none" in found["splits"].findings[1]
@@ -350,100 +297,3 @@ def test_the_bench_searches_as_the_pipeline_does(studied: StudyScene) -> None:
         (s.choice, s.size, s.measurement) for s in studied.search.steps
     ]
     assert studied.evaluator(Setting()).bits == PAPER
-
-
-def test_missing_matplotlib_is_said_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(SystemExit) as left:
-        # The scene does not exist: looking for it would be work.
-        app.main(["study", "paper", str(tmp_path / "none.ply"), "-o", str(tmp_path / "out")])
-    assert left.value.code == 2
-    assert "pip install 'flexgs-edge[charts]'" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_in_use_is_left_alone(project: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
-        study_paper([tmp_path / "none.ply"], out, OPTIONS)
-    with pytest.raises(InputError, match="does not exist"):
-        study_paper([project], tmp_path / "no" / "out", OPTIONS)
-    with pytest.raises(InputError, match="found a file"):
-        check_folder(out / "notes.txt", force=True)
-    # A failure while writing leaves what was there, and nothing else.
-    with pytest.raises(InputError, match="no such file"):
-        study_paper([tmp_path / "none.ply"], out, replace(OPTIONS, force=True))
-    assert [path.name for path in tmp_path.iterdir()] == ["out"] and [path.name for path in out.iterdir()] == [
-        "notes.txt"
-    ]
-
-
-def test_a_folder_that_is_empty_needs_no_force(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    with atomic_folder(tmp_path / "out") as place:
-        (place / "a.csv").write_text("a")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
-
-
-def test_a_forced_folder_keeps_files_of_other_names(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    (out / "fox").mkdir(parents=True)
-    (out / "fox" / "a.csv").write_text("old")
-    (out / "notes.txt").write_text("mine")
-    with atomic_folder(out, force=True) as place:
-        (place / "fox").mkdir()
-        (place / "fox" / "a.csv").write_text("new")
-        (place / "index.html").write_text("page")
-        assert (out / "fox" / "a.csv").read_text() == "old"
-    assert (out / "fox" / "a.csv").read_text() == "new" and (out / "notes.txt").read_text() == "mine"
-    assert sorted(path.name for path in out.iterdir()) == ["fox", "index.html", "notes.txt"]
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_the_command_line_writes_what_the_library_does(
-    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # Two scenes, and two experiments that need few points: the others are the library's business.
-    monkeypatch.setattr("flexgs_edge.studies.paper.study.EXPERIMENTS", (quantization.rtn, whole.times))
-    scene = str(project / "point_cloud.ply")
-    words = ["study", "paper", scene, scene, "-o", str(tmp_path / "out"), "--holdout", "4"]
-    with pytest.raises(SystemExit) as left:
-        app.main([*words, "--max-drop", "4", "--json", "-"])
-    assert left.value.code == 0
-    out = capsys.readouterr()
-    record = json.loads(out.out)
-    assert [scene["name"] for scene in record["scenes"]] == ["cloud", "cloud-2"]
-    assert "cloud: experiment 1 of 2, rtn" in out.err and "RTN at 8 bits" in out.err
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"index.html", "cloud", "cloud-2"}
-
-
-@pytest.mark.parametrize("words", [[], ["paper"]], ids=["study", "study paper"])
-def test_help_teaches(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        app.main(["study", *words, "--help"])
-    text = capsys.readouterr().out
-    assert left.value.code == 0 and "flexgs-edge study paper point_cloud.ply -o study" in text
-    assert all(
-        option.help and option.help.endswith(".") for option in command.params if isinstance(option, click.Option)
-    )
-    known = {option.name for option in command.params}
-    assert set(ViewOptions.__dataclass_fields__) | {"max_drop", "base_psnr", "select"} <= known
-
-
-def test_names_of_scenes() -> None:
-    assert scene_names(["x/garden/point_cloud/iteration_30000/point_cloud.ply", "y.fgs", "z/y.compressed.ply"]) == [
-        "garden",
-        "y",
-        "y-2",
-    ]
-
-
-def test_a_table_refuses_rows_of_other_columns() -> None:
-    with pytest.raises(ValueError, match="expected the columns a, b"):
-        Table(columns(a="A", b="B"), ({"b": 1, "a": 2},))

@@ -1,0 +1,1 @@
+"""Repeats the experiments of the FlexGaussian paper on a scene; see docs/results/paper.md."""

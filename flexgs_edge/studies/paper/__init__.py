@@ -1,1 +1,0 @@
-"""`study paper`: repeats the experiments of the FlexGaussian paper on a user's scenes."""

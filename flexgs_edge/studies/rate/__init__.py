@@ -1,1 +1,0 @@
-"""`study rate`: bytes against quality of each method."""

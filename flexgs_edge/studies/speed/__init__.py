@@ -1,1 +1,0 @@
-"""`study speed`: how much time each method and effort takes, and what it finds."""

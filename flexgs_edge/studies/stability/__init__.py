@@ -1,1 +1,0 @@
-"""`study stability`: under which conditions methods break."""
