@@ -230,6 +230,11 @@ class CompressOptions(ViewOptions):
         return not self.targets and self.max_worst_drop in (None, NONE) and self.max_ssim_drop in (None, NONE)
 
     @property
+    def takes_closest(self) -> bool:
+        """Whether the closest result is written if none holds: who named no target wants a file all the same."""
+        return self.best_effort or self.target_is_default
+
+    @property
     def makes_poses(self) -> bool:
         """Whether made poses are scored and bounded."""
         return self.promise == "whole" if self.views_margin is None else self.views_margin

@@ -42,6 +42,7 @@ from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings, settings_room
@@ -93,6 +94,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
             with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
                 with run.clock.stage("write"):
                     size = coder.write(place, grid, settings, preview)
+                check_smaller(size, run.scene.file_bytes, run.options)
                 limit = run.target.limit_bytes
                 if search.reached and limit is not None and size > limit:
                     raise TargetError(
@@ -282,7 +284,7 @@ def search_rounds(
         if on_step:
             on_step(as_step(step, source.count))
 
-    found = search(make(rounds, measure, see), run.target, best_effort=run.options.best_effort, on_step=report)
+    found = search(make(rounds, measure, see), run.target, best_effort=run.options.takes_closest, on_step=report)
     if found.chosen.left_out:
         LOG.warning(
             "%d Gaussians that no scored pose sees were left out: they lie so far away, or are so extreme, that all others "
