@@ -166,8 +166,8 @@ def decompress(
             loss = conversion_loss(scene, output, options, ordered=not streamed, recentred=recenter)
         if loss.drop is not None and loss.drop > WARN_DROP:
             warnings += (
-                f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; a .ply or a .fgs "
-                "loses none",
+                f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; "
+                f"flexgs-edge decompress {scene.path or 'SCENE'} -o OUT.ply loses nothing",
             )
     for warning in warnings:
         LOG.warning("warning: %s", warning)
