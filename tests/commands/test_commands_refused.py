@@ -134,7 +134,11 @@ def test_a_result_larger_than_its_input_is_not_written(
 ) -> None:
     small = compress(project, tmp_path / "small.fgs", max_size=4000, **FAST).size
     words: dict[str, Any] = {**FAST, "method": method, "cameras": str(project / "cameras.json"), "images": "none"}
-    finer = {"min_fidelity": 60.0} if method == "best" else {"prune_rate": 0.0, "sh_rate": 0.0, "bits": "dc=16,scale=16,rot=16,opacity=16"}
+    finer = (
+        {"min_fidelity": 60.0}
+        if method == "best"
+        else {"prune_rate": 0.0, "sh_rate": 0.0, "bits": "dc=16,scale=16,rot=16,opacity=16"}
+    )
     found = rf"the result would have \d+ bytes, and the input has {small}: nothing was written\. Keep the input, or"
     with pytest.raises(TargetError, match=found):
         compress(tmp_path / "small.fgs", tmp_path / "larger.fgs", **words, **finer)
