@@ -41,7 +41,7 @@ LEAST_SAME, MOST_BYTES = 0.99, 0.02
 def write_project(folder: Path, source: SceneSource, cameras: Sequence[Camera], images: Path | None) -> Path:
     """Write a PLY with cameras.json and linked photos beside it."""
     folder.mkdir()
-    write_ply(folder / "point_cloud.ply", source)
+    write_ply(folder / "point_cloud.ply", source, double=bool(source.origin.any()))
     (folder / "cameras.json").write_text(inria_json(cameras), encoding="utf-8")
     if images is not None:
         (folder / "images").symlink_to(images.resolve(), target_is_directory=True)

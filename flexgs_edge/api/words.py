@@ -76,6 +76,7 @@ class CompressWords(TypedDict, total=False):
     refit: bool
     distil: int | None
     spz_version: int
+    glb: str
     recenter: bool
     force_lossy: bool
     layers: int | None

@@ -40,8 +40,8 @@ GOOD = 0.1
 DECIDING = 0.3
 """Views that are worth less than this share of the best do not decide."""
 NEW, LEAST_NEW, NEW_SHARP = 0.5, 0.001, 0.3
-"""Views that show at least the second share of the Gaussians, which all others together show less than the first, are taken
-however little they are worth, if they count so much for what is too wide in them."""
+"""Views that show at least the second share of the Gaussians, of which all others together show less than the first share of what
+can be shown of them, are taken however little they are worth, if they count so much for what is too wide in them."""
 BLURRED = 0.15
 """Usual deviation of a view's splats, radians, beyond which it shows a blur: matter right before the lens or all around it."""
 NEAR, NEAR_POWER = 0.3, 8
@@ -222,17 +222,17 @@ class Stage:
         ]
         shows = [float((merit * np.rint(scene.stands[view.rows])).sum()) for merit, view in zip(merits, self.views)]
         self.strength = worth * np.array(shows)
-        fullest, seldom = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
+        fullest, most = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
         for view, merit, each, last in zip(self.views, merits, worth, self.last):
-            if each or last:
-                most = fullest if each >= GOOD else seldom
-                most[view.rows] = np.maximum(most[view.rows], merit)
+            for largest, counts in ((fullest, each >= GOOD), (most, each or last)):
+                if counts:
+                    largest[view.rows] = np.maximum(largest[view.rows], merit)
         stands = np.rint(16 * scene.stands)
         needed = stands * (fullest > 0)
         self.seldom = 1 - float(needed.sum()) / max(float(stands.sum()), 1.0)
-        fullest = np.where(fullest > 0, fullest, seldom)
-        stands *= fullest > 0
-        fullest = np.maximum(fullest, 1.0)
+        fullest = np.maximum(np.where(fullest > 0, fullest, most), 1.0)
+        stands *= most > 0
+        most = np.maximum(most, 1.0)
         # A Gaussian counts with the root of what the best view shows of it: rare and faint ones are to be seen too.
         # One that stands for many counts for fewer: dense textures are not all there is to see.
         root = np.rint(16 * np.sqrt(scene.stands * np.sqrt(scene.stands)) * (needed > 0) * np.sqrt(1024 / fullest))
@@ -248,6 +248,8 @@ class Stage:
             enough = float(needed[shown >= 1].sum()) >= SHOWN * float(needed.sum())
             if count is None and not new_only and len(chosen) >= least and enough:
                 new_only, bounds = True, np.where(self.last, np.inf, 0.0)
+                shown *= fullest / most
+                fullest = most
             wanted = stands * (shown < NEW) if new_only else np.rint(root / (1 + shown))
             fresh = np.zeros(len(self.views), bool)
             while not fresh[best := int(np.argmax(bounds))]:
@@ -274,25 +276,33 @@ class Stage:
     def in_order(self, chosen: list[Candidate]) -> list[Candidate]:
         """The chosen views in an order in which every `DEFAULT_HOLDOUT`-th one, from the first, lies between others.
 
-        These are evenly spread over the half whose Gaussians the others show most, without views that are worth little.
+        These show most of what the others show too, each next one what those before it do not, and are worth something.
         """
         if not chosen:
             return []
-        shares, total = self._shares, np.zeros(self.scene.sizes.size)
-        for view in chosen:
-            total[view.rows] += shares[id(view)]
-        alone = []
-        for view in chosen:
-            share = np.rint(UNITS * shares[id(view)]) * np.rint(16 * self.scene.stands[view.rows])
-            others = 1 / (1 + total[view.rows] - shares[id(view)])
-            alone.append(float(np.rint(share * others).sum()) / max(float(share.sum()), 1.0))
-        count = len(chosen)
-        held = -(-count // DEFAULT_HOLDOUT)
-        rank = np.array(alone) + [2.0 * (self._worths[id(view)] < DECIDING) for view in chosen]
-        among = np.argsort(rank, kind="stable")[: max(held, count // 2)]
-        between = [int(among[turn * among.size // held]) for turn in range(held)]
-        last, first = iter(between), iter([turn for turn in range(count) if turn not in between])
-        return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(count)]
+        shares, total = [self._shares[id(view)] for view in chosen], np.zeros(self.scene.sizes.size)
+        for view, share in zip(chosen, shares):
+            total[view.rows] += share
+        between: list[int] = []
+        held = np.zeros(total.size)
+        left = [self._worths[id(view)] >= DECIDING for view in chosen]
+        if not any(left):
+            left = [True] * len(chosen)
+        while len(between) < -(-len(chosen) // DEFAULT_HOLDOUT):
+            if not any(left):
+                left = [place not in between for place in range(len(chosen))]
+            gains = np.full(len(chosen), -1.0)
+            for place, (view, share) in enumerate(zip(chosen, shares)):
+                if left[place]:
+                    others = total[view.rows] - share
+                    wanted = self.scene.stands[view.rows] * share * others / ((1 + others) * (1 + held[view.rows]))
+                    gains[place] = float(np.rint(1024 * wanted).sum())
+            best = int(np.argmax(gains))
+            between.append(best)
+            left[best] = False
+            held[chosen[best].rows] += shares[best]
+        last, first = iter(between), iter([turn for turn in range(len(chosen)) if turn not in between])
+        return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(len(chosen))]
 
 
 def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import signal
 import sys
 import time
@@ -73,9 +74,12 @@ def command() -> None:
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit with its code. Only this function turns errors into messages."""
+    _open_streams()
     state = State()
     with suppress(ValueError):  # raised outside the main thread, whose owner handles signals
-        _exit_on(signal.SIGTERM)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:  # as under `nohup`
+                _exit_on(number)
     try:
         code = command.main(
             args=None if argv is None else list(argv), prog_name="flexgs-edge", standalone_mode=False, obj=state
@@ -85,6 +89,19 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
             traceback.print_exc()
         code = _exit_code(error)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _open_streams() -> None:
+    """Read nothing from, and write nowhere to, standard streams that are closed. Files that we open would take their numbers."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            found = os.open(os.devnull, os.O_RDWR)
+            if found != number:
+                os.dup2(found, number)
+                os.close(found)
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
 
 
 def _exit_on(number: int) -> None:

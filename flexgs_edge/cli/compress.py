@@ -149,7 +149,7 @@ Several scenes:
 )
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")
 @option(OUTPUT, "--format", metavar="SUFFIX", help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.")
-@shared_options.spz_version_option
+@shared_options.writing_options
 @shared_options.positions_options
 @option(
     OUTPUT,

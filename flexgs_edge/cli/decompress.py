@@ -15,10 +15,18 @@ from flexgs_edge.cli import help_page, shared_options, talk
     "--output",
     metavar="OUT",
     required=True,
-    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, or FOLDER/lod-meta.json (streamed SOG).",
+    help="File to write: .ply, .spz, .sog, .compressed.ply, .splat, .glb, .usd, .usda, .usdc, .usdz, or FOLDER/lod-meta.json "
+    "(streamed SOG).",
 )
 @shared_options.positions_options
-@shared_options.spz_version_option
+@shared_options.writing_options
+@help_page.option(
+    help_page.OUTPUT,
+    "--double",
+    is_flag=True,
+    help="Write x y z of a .ply as doubles, which not every program reads. Default: the type that came in. A .fgs does not keep "
+    "it: floats, unless they would ruin a scene far from zero.",
+)
 @help_page.option(
     help_page.VIEWS,
     "--cameras",
@@ -42,6 +50,8 @@ def command(
     recenter: bool,
     force_lossy: bool,
     spz_version: int,
+    glb: str,
+    double: bool,
     cameras: str | None,
     frame: str | None,
     lod: int | None,
@@ -57,8 +67,8 @@ def command(
     INPUT is a .fgs, .ply, .spz, .sog or .compressed.ply file, or a model folder. Decoding a .fgs is exact: the same bits on
     every machine.
 
-    A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats, little endian.
-    Gaussians without view-dependent colour get zeros for it.
+    A .ply has INRIA's layout: x y z, normals (zero), colours, opacity, scales and rotations, as 32-bit floats (--double: x y z
+    as 64-bit ones), little endian. Gaussians without view-dependent colour get zeros for it.
 
     Formats of other programs round values in their own ways. What that loses is measured and printed. To make such a file
     smaller, use compress.
@@ -76,10 +86,9 @@ def command(
     """
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.decompress import decompress
-    from flexgs_edge.io.reading import Reading
+    from flexgs_edge.io.reading import Reading, Writing
 
     reading = Reading.of(frame, lod, sh_degree)
-    result = decompress(
-        input, output, force, memory_limit, device, reading, spz_version, force_lossy, recenter, cameras
-    )
+    writing = Writing(spz_version, force_lossy=force_lossy, glb=glb, double=double)
+    result = decompress(input, output, force, memory_limit, device, reading, writing, recenter, cameras)
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -33,8 +33,22 @@ reading_options = stack(
         help="Leave out view-dependent colour (SH) above degree N. Default: keep all.",
     ),
 )  # Options of every command that reads a scene with its values
-spz_version_option = option(
-    OUTPUT, "--spz-version", metavar="3|4", type=int, default=3, help="Version of a .spz. Older programs read only 3."
+writing_options = stack(
+    option(
+        OUTPUT,
+        "--spz-version",
+        metavar="3|4",
+        type=int,
+        default=3,
+        help="Version of a .spz. Older programs read only 3.",
+    ),
+    option(
+        OUTPUT,
+        "--glb",
+        metavar="plain|spz",
+        default="plain",
+        help="What holds the values of a .glb. spz: much smaller, by a draft of an extension that CesiumJS reads.",
+    ),
 )
 positions_options = stack(
     option(
@@ -147,7 +161,7 @@ base_psnr_option = option(
     metavar="DB",
     type=float,
     help="The modelled drop (the estimate without photos) assumes this PSNR of the original against its photos. "
-    "Higher is more cautious. Default: PSNR of its views against themselves, moved by three quarters of a pixel (28 to 36).",
+    "Higher is more cautious. Default: PSNR of its views against themselves, moved by three quarters of a pixel (32.5 to 36).",
 )
 drop_invalid_option = option(
     VIEWS,

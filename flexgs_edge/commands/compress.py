@@ -47,9 +47,6 @@ def compress(
     `TargetError`, `DeviceError` or `BudgetError`; nothing is left behind then.
     """
     options = replace(options or CompressOptions(), **words)
-    if options.target_is_default:
-        # The scene or the format may be out of the default target's reach. Who named no target wants a file all the same.
-        options = replace(options, best_effort=True)
     run = open_compression(input, output, options, progress, given)
     method = paper if options.method == "paper" else best if run.output.format is None else foreign
     with ExitStack() as stack:

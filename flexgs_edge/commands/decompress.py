@@ -20,13 +20,14 @@ from flexgs_edge.io.exchange import (
     MovedSource,
     check_positions,
     offset_place,
+    wants_double,
     write_foreign,
     write_offset,
     write_streamed,
 )
 from flexgs_edge.io.formats import FORMATS, WRITTEN, Format, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
-from flexgs_edge.io.reading import AS_WRITTEN, Reading, Writing
+from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.file_results import DecompressResult
@@ -56,14 +57,13 @@ def decompress(
     memory_limit: int | None = None,
     device: str | None = None,
     reading: Reading = AS_WRITTEN,
-    spz_version: int = 3,
-    force_lossy: bool = False,
+    writing: Writing = PLAIN,
     recenter: bool = False,
     cameras: str | None = None,
 ) -> DecompressResult:
     """Decode a scene to a PLY in INRIA's layout, or convert it to another format.
 
-    The PLY is little endian with zero normals, and is written chunk by chunk.
+    The PLY is little endian with zero normals, and is written chunk by chunk. Its positions have the type that came in.
 
     Parameters
     ----------
@@ -77,10 +77,8 @@ def decompress(
         Bytes for the whole process. Default: three quarters of the free memory.
     reading : Reading, optional
         Frame, level of detail and SH degree.
-    spz_version : {3, 4}
-        Version of a `.spz`.
-    force_lossy : bool
-        Write a scene also where the format cannot hold its positions, see `check_positions`.
+    writing : Writing, optional
+        How the file is written.
     recenter : bool
         Move a scene that lies far from zero to zero, and write the offset beside `output` (other programs' formats).
     cameras : str, optional
@@ -102,21 +100,22 @@ def decompress(
         If the input does not follow its format.
     """
     streamed = Path(output).name == STREAMED
-    format = FORMATS[".sog"] if streamed else written_format(output)
+    format = FORMATS[".sog"] if streamed else written_format(output, writing)
     if format is None and Path(output).suffix.lower() != ".ply":
         raise InputError(f"-o {output}: expected a name that ends in .ply, {', '.join(WRITTEN)}, or {STREAMED}")
     if streamed:
         check_folder(Path(output).parent, force)
     else:
         check_writable(output, force)
-    if format is None and (recenter or force_lossy):
+    if format is None and (recenter or writing.force_lossy):
         raise InputError(
             f"--{'recenter' if recenter else 'force-lossy'}: a .ply holds the scene as it is; leave it out, or write one of "
             f"{', '.join(WRITTEN)}"
         )
+    if format is not None and writing.double:
+        raise InputError(f"--double: only a .ply has positions of another type, not {format.suffix}; leave it out")
     if cameras not in (None, AUTO_CAMERAS, NO_CAMERAS):
         read_cameras(cameras)
-    writing = Writing(spz_version)
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
@@ -137,8 +136,8 @@ def decompress(
             source = decoded_once(scene.source, budget, needed, backend)
             scene = replace(scene, source=source)
             source = MovedSource(source, np.zeros(3)) if recenter else source
-            warnings = check_positions(source, format, force_lossy)
-            writing = Writing(spz_version, antialiased, force_lossy=True)  # positions are checked
+            warnings = check_positions(source, format, writing.force_lossy)
+            writing = replace(writing, antialiased=antialiased, force_lossy=True)  # positions are checked
             if streamed:
                 layers, preview = _layers(input, source.count, reading)
                 notes = write_streamed(
@@ -152,7 +151,8 @@ def decompress(
             rows = budget.rows("decoding", row, fixed=decoding + decoding // SPARE_SHARE, minimum=least, most=65536)
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
-                notes = write_ply(output, scene.source, force=force, chunk_rows=rows)
+                double, warnings = (True, ()) if writing.double else wants_double(scene.source, rows)
+                notes = write_ply(output, scene.source, force=force, chunk_rows=rows, double=double)
         if recenter:
             assert format is not None
             notes = (*notes, write_offset(output, scene.source.origin, format, force))
@@ -166,8 +166,8 @@ def decompress(
             loss = conversion_loss(scene, output, options, ordered=not streamed, recentred=recenter)
         if loss.drop is not None and loss.drop > WARN_DROP:
             warnings += (
-                f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; a .ply or a .fgs "
-                "loses none",
+                f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; "
+                f"flexgs-edge decompress {scene.path or 'SCENE'} -o OUT.ply loses nothing",
             )
     for warning in warnings:
         LOG.warning("warning: %s", warning)

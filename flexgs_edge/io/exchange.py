@@ -82,7 +82,7 @@ def write_foreign(
     BudgetError
         If the disk is full.
     """
-    format = written_format(path)
+    format = written_format(path, writing)
     assert format is not None
     if source.count == 0:
         raise InputError(f"{source.name}: the scene is empty: nothing to write to {path}")
@@ -229,6 +229,26 @@ def check_positions(source: SceneSource, format: Format, force_lossy: bool = Fal
             f"{source.name}: {words}. Write a .fgs, .ply or .glb, leave out what lies far away, or use --force-lossy"
         )
     return (words,)
+
+
+def wants_double(source: SceneSource, chunk_rows: int = 65536) -> tuple[bool, tuple[str, ...]]:
+    """Whether the positions of a PLY should be `double`, and warnings.
+
+    They are what came in. Where a file does not tell, as a `.fgs`, floats do, unless they would move most Gaussians by more
+    than their own size: such a scene did not come as floats.
+    """
+    if source.doubles is not None or not np.any(source.origin):
+        return bool(source.doubles), ()
+    found = rounding_of(source, Format(".ply", reader=""), chunk_rows)
+    if 2 * found.moved > source.count:
+        return True, ()
+    if found.error <= found.smallest / 10:
+        return False, ()
+    words = (
+        f"floats hold positions of this scene only to {found.error:.2g}, and the smallest splat measures {found.smallest:.2g}: "
+        "--double keeps them as they are, where they came as doubles"
+    )
+    return False, (words,)
 
 
 def offset_place(path: str | os.PathLike[str]) -> Path:

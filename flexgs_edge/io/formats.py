@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame
+from flexgs_edge.io.reading import PLAIN, Reading, Writing
 
 
 def _as_float32(means: np.ndarray, largest: float) -> np.ndarray:
@@ -58,15 +60,23 @@ class Format:
     sh_bytes: float = 0.0
     memory: int = 512  # Most bytes a Gaussian that writing and reading back hold
     marks_antialiased: bool = False  # Whether its files can say that a model is antialiased
+    # A module that reading and writing load, and the extra of this package that brings it; or nothing
+    needs: tuple[str, ...] = ()
 
-    def read(self, *arguments: Any) -> Any:
+    def read(self, path: Path, name: str, reading: Reading) -> Any:
         """Call the reader."""
-        return _function(self.reader)(*arguments)
+        self.check_needs(name)
+        return _function(self.reader)(path, name, reading)
 
     def write(self, *arguments: Any) -> None:
         """Call the writer."""
         assert self.writer is not None
         _function(self.writer)(*arguments)
+
+    def check_needs(self, name: object) -> None:
+        """Raise `InputError` if an extra is missing that this format needs."""
+        if self.needs and find_spec(self.needs[0]) is None:
+            raise InputError(f"{name}: {self.suffix} files need pip install 'flexgs-edge[{self.needs[1]}]'")
 
     @property
     def word(self) -> str:
@@ -109,8 +119,19 @@ FORMATS: dict[str, Format] = {
             keeps_origin=True, fixed_rows=True, row_bytes=232.0, sh_bytes=180.0, memory=1024,
         ),
         Format(".gltf", f"{_IO}.gltf:read_gltf", frame=LUF),
+        *(
+            Format(
+                f".{word}", f"{_IO}.usd:read_usd", f"{_IO}.usd:write_{word}", RUB, keeps_origin=True, max_degree=4,
+                fixed_rows=True, row_bytes=224.0, sh_bytes=180.0, memory=memory, needs=("pxr", "usd"),
+            )
+            for word, memory in (("usd", 3072), ("usda", 10240), ("usdc", 3072), ("usdz", 3072))
+        ),
     )
 }  # fmt: skip
+_GLB_SPZ = replace(
+    FORMATS[".glb"], writer=f"{_IO}.glb_writer:write_glb_spz", reach=FORMATS[".spz"].reach, position_error=_fixed_point,
+    fixed_rows=False, marks_antialiased=True,
+)  # fmt: skip
 WRITTEN: tuple[str, ...] = tuple(suffix for suffix, format in FORMATS.items() if format.writer)
 """Suffixes that can be written."""
 
@@ -121,9 +142,11 @@ def format_of(path: str | os.PathLike[str]) -> Format | None:
     return next((format for suffix, format in FORMATS.items() if name.endswith(suffix)), None)
 
 
-def written_format(path: str | os.PathLike[str]) -> Format | None:
+def written_format(path: str | os.PathLike[str], writing: Writing = PLAIN) -> Format | None:
     """The format that a file of this name is written in, or None; raises `InputError` for formats that are only read."""
     format = format_of(path)
     if format is not None and format.writer is None:
         raise InputError(f"-o {path}: {format.suffix} files are only read; write one of {', '.join(WRITTEN)}")
-    return format
+    if format is not None:
+        format.check_needs(path)
+    return _GLB_SPZ if format is FORMATS[".glb"] and writing.glb == "spz" else format

@@ -2,14 +2,18 @@
 
 Each attribute has its own buffer view. Rotations are normalized shorts, off by at most 0.004 degrees; an opacity takes 4 bytes
 whatever its type, since rows of attributes begin at multiples of 4. The extension allows only floats for SH.
+
+With `--glb spz`, the buffer is a `.spz` (`io.gltf` has the source), and accessors without a buffer view say what it unpacks to.
+CesiumJS takes buffer view 0 whatever the file says, and asks for a node with a matrix and for both extensions as required ones.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,9 +21,12 @@ import numpy as np
 from flexgs_edge._version import __version__
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import InputError
-from flexgs_edge.io.gltf import EXTENSION
+from flexgs_edge.io.frames import LUF, RUB, in_frame
+from flexgs_edge.io.gltf import EXTENSION, SPZ_EXTENSIONS
 from flexgs_edge.io.gltf_container import BIN_CHUNK, COMPONENTS, JSON_CHUNK, MAGIC, WIDTHS
 from flexgs_edge.io.reading import Writing
+from flexgs_edge.io.spz import spz_source
+from flexgs_edge.io.spz_writer import write_spz
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import Planes, SceneSource
 
@@ -60,23 +67,39 @@ def write_glb(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     Raises `InputError` if the file would have more than 4 GiB, the most that a `.glb` can have.
     """
     attributes = _attributes(source.sh_degree)
-    header = _header(source, attributes)
-    length = sum(attribute.row_bytes for attribute in attributes) * source.count
-    total = 28 + len(header) + length
-    if total > _LARGEST:
-        raise InputError(
-            f"{source.name}: {source.count} Gaussians need {total} bytes as .glb, which holds {_LARGEST} at most; "
-            "use --sh-degree, or write another format"
-        )
-    file.write(MAGIC + struct.pack("<4I", 2, total, len(header), JSON_CHUNK) + header)
-    file.write(struct.pack("<2I", length, BIN_CHUNK))
-    start = 28 + len(header)
+    sizes = [attribute.row_bytes * source.count for attribute in attributes]
+    starts = np.cumsum([0, *sizes]).tolist()
+    record = _record(source, attributes, _bounds(source))
+    record["bufferViews"] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": size, "target": _VERTICES}
+        for start, size in zip(starts, sizes)
+    ]
+    for index, accessor in enumerate(record["accessors"]):
+        accessor["bufferView"] = index
+    at = _begin(file, source, record, starts[-1])
     for rows in source.chunks(_CHUNK_ROWS):
-        planes, at = source.read(rows, list(FIELD)), start
-        for attribute in attributes:
-            file.seek(at + attribute.row_bytes * rows.start)
+        planes = source.read(rows, list(FIELD))
+        for start, attribute in zip(starts, attributes):
+            file.seek(at + start + attribute.row_bytes * rows.start)
             file.write(attribute.pack(planes))
-            at += attribute.row_bytes * source.count
+
+
+def write_glb_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
+    """Write a scene with its values as a `.spz`; otherwise as `write_glb`."""
+    packed = io.BytesIO()
+    write_spz(packed, in_frame(in_frame(source, LUF), RUB), Writing(antialiased=writing.antialiased))
+    data = packed.getvalue()
+    position, colour, rotation, scale, _, _, *rest = _attributes(source.sh_degree)
+    # The draft has no attributes for opacities and constant colours.
+    attributes = [position, colour, replace(rotation, component=_FLOAT), scale, *rest]
+    record = _record(source, attributes, _bounds(in_frame(in_frame(spz_source(data, source.name), RUB), LUF)))
+    extensions = [EXTENSION, SPZ_EXTENSIONS[0]]
+    record |= {"extensionsUsed": extensions, "extensionsRequired": extensions}
+    record["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["extensions"] = {SPZ_EXTENSIONS[0]: {"bufferView": 0}}
+    record["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
+    record["nodes"] = [{"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, *source.origin.tolist(), 1]}]
+    _begin(file, source, record, len(data))
+    file.write(data + b"\0" * (-len(data) % 4))
 
 
 def _attributes(sh_degree: int) -> list[_Attribute]:
@@ -85,8 +108,8 @@ def _attributes(sh_degree: int) -> list[_Attribute]:
         _Attribute("POSITION", _FLOAT, "VEC3", lambda planes: planes["means"]),
         _Attribute("COLOR_0", _UNSIGNED_BYTE, "VEC4", _colours),
         _Attribute(f"{EXTENSION}:ROTATION", _SHORT, "VEC4", lambda planes: planes["quats"][[1, 2, 3, 0]]),
-        _Attribute(f"{EXTENSION}:SCALE", _FLOAT, "VEC3", _scales),
-        _Attribute(f"{EXTENSION}:OPACITY", _FLOAT, "SCALAR", _opacities),
+        _Attribute(f"{EXTENSION}:SCALE", _FLOAT, "VEC3", linear_scales),
+        _Attribute(f"{EXTENSION}:OPACITY", _FLOAT, "SCALAR", plain_opacities),
         _Attribute(f"{EXTENSION}:SH_DEGREE_0_COEF_0", _FLOAT, "VEC3", lambda planes: planes["sh_dc"]),
     ]
     for degree in range(1, sh_degree + 1):
@@ -107,29 +130,20 @@ class _Coefficient:
         return rest[self.index :: len(rest) // 3]
 
 
-def _header(source: SceneSource, attributes: list[_Attribute]) -> bytes:
-    """The JSON, padded to a multiple of 4 bytes."""
-    views, accessors, start = list[dict[str, Any]](), list[dict[str, Any]](), 0
-    for index, attribute in enumerate(attributes):
-        length = attribute.row_bytes * source.count
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": length, "target": _VERTICES})
-        accessor = {
-            "bufferView": index,
-            "componentType": attribute.component,
-            "count": source.count,
-            "type": attribute.type,
-        }
-        if attribute.component != _FLOAT:
-            accessor["normalized"] = True
-        accessors.append(accessor)
-        start += length
-    accessors[0] |= _bounds(source)
+def _record(source: SceneSource, attributes: list[_Attribute], bounds: dict[str, list[float]]) -> dict[str, Any]:
+    """The JSON, without buffers and what lies where in them."""
+    accessors: list[dict[str, Any]] = [
+        {"componentType": attribute.component, "count": source.count, "type": attribute.type}
+        | ({} if attribute.component == _FLOAT else {"normalized": True})
+        for attribute in attributes
+    ]
+    accessors[0] |= bounds
     primitive = {
         "attributes": {attribute.name: index for index, attribute in enumerate(attributes)},
         "mode": _POINTS,
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
-    record = {
+    return {
         "asset": {"version": "2.0", "generator": f"flexgs-edge {__version__}"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
@@ -137,11 +151,22 @@ def _header(source: SceneSource, attributes: list[_Attribute]) -> bytes:
         "nodes": [{"mesh": 0} | ({"translation": source.origin.tolist()} if np.any(source.origin) else {})],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
     }
-    text = json.dumps(record, separators=(",", ":")).encode()
-    return text + b" " * (-len(text) % 4)
+
+
+def _begin(file: BinaryIO, source: SceneSource, record: dict[str, Any], length: int) -> int:
+    """Write all but the buffer of `length` bytes; returns where it begins. Chunks are padded to multiples of 4 bytes."""
+    text = json.dumps(record | {"buffers": [{"byteLength": length}]}, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    start, padded = 28 + len(text), length + -length % 4
+    if start + padded > _LARGEST:
+        raise InputError(
+            f"{source.name}: {source.count} Gaussians need {start + padded} bytes as .glb, which holds {_LARGEST} at most; "
+            "use --sh-degree, or write another format"
+        )
+    file.write(MAGIC + struct.pack("<4I", 2, start + padded, len(text), JSON_CHUNK) + text)
+    file.write(struct.pack("<2I", padded, BIN_CHUNK))
+    return start
 
 
 def _bounds(source: SceneSource) -> dict[str, list[float]]:
@@ -153,14 +178,16 @@ def _bounds(source: SceneSource) -> dict[str, list[float]]:
     return {"min": low.tolist(), "max": high.tolist()}
 
 
-def _scales(planes: Planes) -> np.ndarray:
+def linear_scales(planes: Planes) -> np.ndarray:
+    """[3, n] f64, standard deviations."""
     # Neither zero nor infinite, which a reader could not take back.
     limits = np.finfo(np.float32)
     found: np.ndarray = np.clip(_exp(planes["log_scales"]), limits.tiny, limits.max)
     return found
 
 
-def _opacities(planes: Planes) -> np.ndarray:
+def plain_opacities(planes: Planes) -> np.ndarray:
+    """[1, n] f64, 0 to 1."""
     found: np.ndarray = 1 / (1 + _exp(-planes["opacity_logits"]))
     return found
 
@@ -168,7 +195,7 @@ def _opacities(planes: Planes) -> np.ndarray:
 def _colours(planes: Planes) -> np.ndarray:
     """[4, n], what a viewer without splats shows: colours without SH, and opacities."""
     colours = np.clip(planes["sh_dc"].astype(np.float64) * SH_C0 + 0.5, 0, 1)
-    found: np.ndarray = np.concatenate([colours, _opacities(planes)])
+    found: np.ndarray = np.concatenate([colours, plain_opacities(planes)])
     return found
 
 

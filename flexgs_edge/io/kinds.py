@@ -95,6 +95,9 @@ def kind_of(path: Path, name: str) -> Kind | None:
         return Kind("a .spz file", suffix=".spz")
     if head.startswith(b"glTF"):
         return Kind("a binary glTF file", suffix=".glb")
+    if head.startswith((b"PXR-USDC", b"#usda ")):
+        binary = head.startswith(b"PXR")
+        return Kind("a USD file", suffix=".usdc" if binary else ".usda", hosts=(".usd",))
     if head.startswith(_FGS):
         return Kind("a .fgs file", suffix=".fgs")
     if head.startswith(b"\x93NUMPY"):
@@ -155,9 +158,11 @@ def _zip_kind(path: Path) -> Kind:
         return Kind("a .sog file", suffix=".sog")
     if "data.pkl" in names:
         return Kind("a PyTorch checkpoint", "export a PLY from it with the program that trained it")
+    if any(name.endswith((".usd", ".usda", ".usdc")) for name in names):
+        return Kind("a .usdz file", suffix=".usdz")
     if any(name.endswith(".npy") for name in names):
         return Kind("a NumPy archive", "give its arrays to Scene.from_arrays in Python")
-    return Kind("a zip archive", "unpack it, and give the scene in it", hosts=(".sog",))
+    return Kind("a zip archive", "unpack it, and give the scene in it", hosts=(".sog", ".usdz"))
 
 
 def _text_kind(text: bytes) -> Kind | None:

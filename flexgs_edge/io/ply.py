@@ -66,6 +66,7 @@ class PlySource(SceneSource):
             self.sh_degree, self.notes = gaussian_layout(header)
             self.comments = header.comments
             self._smoothed, self._colours = smoothing_of(header), colour_names(header)
+            self.doubles = any(p.type == "f8" for p in header.vertex.properties if p.name in FIELD["means"].ply)
             antialiased = self._smoothed or header.antialiased
             self.settings: dict[str, Any] = {} if antialiased is None else {"antialiased": antialiased}
             behind = header.check_size(stamp[1])
@@ -297,21 +298,23 @@ def _load_whole(path: Path, header: PlyHeader) -> tuple[np.ndarray, int]:
 
 
 def write_ply(
-    path: str | os.PathLike[str], source: SceneSource, *, force: bool = False, chunk_rows: int = 65536
+    path: str | os.PathLike[str],
+    source: SceneSource,
+    *,
+    force: bool = False,
+    chunk_rows: int = 65536,
+    double: bool = False,
 ) -> tuple[str, ...]:
     """Write a scene in INRIA's layout: x y z, nx ny nz (zeros), f_dc, f_rest, opacity, scale, rot; little endian.
 
-    Properties are `float`. Positions are world positions. They are `double` only where the origin is not zero and
-    float32 does not hold them exactly. The source's `comments` are written to the header.
+    Properties are `float`. Positions are world positions. The source's `comments` are written to the header.
 
     `path`: gets its name only when the file is complete. `source`: may be the very file that is overwritten. `force`:
-    replace an existing file. `chunk_rows`: rows held in memory at a time. Returns notes for the summary. Raises
-    `InputError` if the file exists and `force` is not set, or the folder is missing. Raises `BudgetError` if the disk
-    is full.
+    replace an existing file. `chunk_rows`: rows held in memory at a time. `double`: positions are `double`; see
+    `exchange.wants_double`. Returns notes for the summary. Raises `InputError` if the file exists and `force` is not
+    set, or the folder is missing. Raises `BudgetError` if the disk is full.
     """
-    # What lies on a grid of ours (`valid`) is not decoded a second time to find out.
-    wide = bool(np.any(source.origin != 0)) and (source.valid or not _floats_hold(source, chunk_rows))
-    dtype = inria_dtype(source.sh_degree, wide)
+    dtype = inria_dtype(source.sh_degree, double)
     kinds = {"<f4": "float", "<f8": "double"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {source.count}"]
     lines += [f"property {kinds[dtype[name].str]} {name}" for name in dtype.names or ()]
@@ -319,7 +322,7 @@ def write_ply(
     with atomic_write(path, force) as file:
         file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
         table = np.zeros((min(source.count, chunk_rows), len(dtype.names or ())), np.float32)
-        block = np.zeros(len(table), dtype) if wide else None
+        block = np.zeros(len(table), dtype) if double else None
         for rows in source.chunks(chunk_rows):
             part = source.read_table(rows, table)
             if block is not None:
@@ -333,17 +336,7 @@ def write_ply(
                 if np.any(source.origin != 0):
                     part[:, :3] = part[:, :3] + source.origin
                 file.write(part.astype("<f4", copy=False).data)
-    where = ", ".join(f"{value:g}" for value in source.origin)
-    return (f"positions written as double: the scene is far from zero (origin {where})",) if wide else ()
-
-
-def _floats_hold(source: SceneSource, chunk_rows: int) -> bool:
-    """Whether float32 holds every world position exactly, as it does for all that came from floats."""
-    for rows in source.chunks(chunk_rows):
-        world = source.read(rows, ["means"])["means"] + source.origin[:, None]
-        if not np.array_equal(world, world.astype(np.float32)):
-            return False
-    return True
+    return ("positions written as double",) if double else ()
 
 
 def inria_dtype(sh_degree: int, wide: bool = False) -> np.dtype:

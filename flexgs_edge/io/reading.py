@@ -31,18 +31,25 @@ class Reading:
             raise InputError(f"--lod {self.lod}: expected 0 (the finest level) or more")
 
 
+GLB_KINDS = ("plain", "spz")
+
+
 @dataclass(frozen=True)
 class Writing:
-    """How to write another program's format."""
+    """How to write a scene for other programs."""
 
     spz_version: int = 3  # Version of a `.spz`. Older programs read only 3.
     antialiased: bool = False  # the model is antialiased; formats that can say so, do
     # Write a scene also where the format cannot hold its positions: see `check_positions`.
     force_lossy: bool = False
+    glb: str = "plain"  # What holds the values of a `.glb`: `plain` numbers or a `spz`.
+    double: bool = False  # Positions of a `.ply` are float64. Default: as they came, see `exchange.wants_double`.
 
     def __post_init__(self) -> None:
         if self.spz_version not in (3, 4):
             raise InputError(f"--spz-version {self.spz_version}: expected 3 or 4")
+        if self.glb not in GLB_KINDS:
+            raise InputError(f"--glb {self.glb}: expected {' or '.join(GLB_KINDS)}")
 
 
 AS_WRITTEN = Reading()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexgs_edge.errors import DeviceError
+from flexgs_edge.kernels.compiler_cache import prepare_compiler_cache
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -96,6 +97,7 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     """
     import pyopencl as cl
 
+    prepare_compiler_cache()
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # PLATFORM_NOT_FOUND_KHR: no runtime is installed

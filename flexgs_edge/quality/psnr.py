@@ -33,8 +33,8 @@ LEAST_GAIN = 0.5
 MOVED = 0.0015
 """By this angle pictures are moved to tell how far photos may be from them, radians: three quarters of a pixel of an automatic
 view."""
-LONE_BASES = 28.0, 36.0
-"""Least and largest base without photos, dB: those of usual models."""
+LONE_BASES = 32.5, 36.0
+"""Least and largest base without photos, dB: the moved pictures of real cameras lie between these."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -147,8 +147,8 @@ def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
     `errors`: `moved_error` of the original's render in each view. `coverages`: share of each view that the original
     covers, which alone counts.
 
-    >>> lone_base([1e-3, 5e-4], [1.0, 0.5]), lone_base([0.0], [1.0])
-    (30.0, 36.0)
+    >>> lone_base([5e-4, 2.5e-4], [1.0, 0.5]), lone_base([0.0], [1.0])
+    (33.0, 36.0)
     """
     error = math.fsum(errors) / (math.fsum(coverages) or 1.0)
     low, high = LONE_BASES

@@ -29,8 +29,8 @@ class ConversionLoss:
     cameras: str = ""
     fidelity: float | None = None
     worst: float | None = None
-    drop: float | None = None  # modelled drop from `base_psnr`, dB
-    base_psnr: float | None = None
+    drop: float | None = None  # drop against the photos, or modelled drop from `base_psnr`, dB
+    base_psnr: float | None = None  # `None` where photos tell
     why: str = ""  # why no pictures were compared
 
     def lines(self) -> list[str]:
@@ -53,7 +53,11 @@ class ConversionLoss:
             if self.fidelity is None
             else f"fidelity {self.fidelity:.2f} dB, worst {self.worst:.2f} dB"
         )
-        lost = f"; modelled drop {self.drop:.3f} dB from a base of {self.base_psnr:g} dB"
+        lost = (
+            f"; drop {self.drop:.3f} dB against the photos"
+            if self.base_psnr is None
+            else f"; modelled drop {self.drop:.3f} dB from a base of {self.base_psnr:g} dB"
+        )
         return [*lines, line("pictures", f"{same}{lost} ({self.views} views, cameras from {self.cameras})")]
 
 

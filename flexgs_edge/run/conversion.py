@@ -20,10 +20,6 @@ from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import open_run
 from flexgs_edge.scene.source import SceneSource
 
-VIEWS = 4
-"""Views whose pictures are compared."""
-WIDTH = 640
-"""Largest width of these pictures, pixels."""
 _ROWS = 1 << 16
 """Rows whose values are compared."""
 
@@ -35,7 +31,7 @@ def conversion_loss(
     ordered: bool = True,
     recentred: bool = False,
 ) -> ConversionLoss:
-    """Compare a written file with its scene.
+    """Compare a written file with its scene, by the views and the photos that `evaluate` takes.
 
     Parameters
     ----------
@@ -64,10 +60,10 @@ def conversion_loss(
     if options.device == "numpy" and options.cameras is None:
         return ConversionLoss(values, why="NumPy draws slowly: --cameras PATH compares them all the same")
     try:
-        run = open_run(scene, replace(options, holdout=0, resolution=WIDTH, images="none"), photos=False)
+        run = open_run(scene, options)
         if options.device != "numpy":
             run.budget.require("the OpenCL runtime", RUNTIME_BYTES + BUILD_BYTES)
-        chosen = run.seen.train[:: -(-len(run.seen.train) // VIEWS)]
+        chosen = run.seen.held_out or run.seen.train
         with open_context(run) as context:
             judge = QualityEvaluator(context, run.source, run.seen, chosen)
             with context.renderer.load(run.source) as original:
@@ -77,15 +73,16 @@ def conversion_loss(
             judge.close()
     except (BudgetError, DeviceError, InputError) as error:
         return ConversionLoss(values, why=str(error))
-    worst = quality.worst
+    covered = quality.covered_decides
+    found = [view.covered_fidelity if covered else view.fidelity for view in quality.views]
     return ConversionLoss(
         values,
         views=len(chosen),
         cameras=run.seen.cameras_from,
         fidelity=quality.deciding_fidelity,
-        worst=None if worst is None else (worst.covered_fidelity if quality.covered_decides else worst.fidelity),
+        worst=min((value for value in found if value is not None), default=None),
         drop=quality.usual_drop,
-        base_psnr=quality.base_psnr,
+        base_psnr=None if run.seen.photos is not None else quality.base_psnr,
     )
 
 

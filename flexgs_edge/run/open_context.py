@@ -31,7 +31,7 @@ def open_context(
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None
     assert options.antialiased is not None
-    drawing = options.near, options.background, options.antialiased
+    drawing = options.near, run.background or options.background, options.antialiased
     if needed is not None:
         with run.clock.stage("open"):
             foresee(run, False, needed, compares)

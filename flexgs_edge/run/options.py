@@ -150,6 +150,7 @@ class CompressOptions(ViewOptions):
     refit: bool = True
     distil: int | None = None
     spz_version: int = 3
+    glb: str = "plain"
     recenter: bool = False
     force_lossy: bool = False
     layers: int | None = None
@@ -225,6 +226,11 @@ class CompressOptions(ViewOptions):
         return not self.targets and self.max_worst_drop in (None, NONE) and self.max_ssim_drop in (None, NONE)
 
     @property
+    def takes_closest(self) -> bool:
+        """Whether the closest result is written if none holds: who named no target wants a file all the same."""
+        return self.best_effort or self.target_is_default
+
+    @property
     def makes_poses(self) -> bool:
         """Whether made poses are scored and bounded."""
         return self.promise == "whole" if self.views_margin is None else self.views_margin
@@ -232,7 +238,7 @@ class CompressOptions(ViewOptions):
     @property
     def writing(self) -> Writing:
         """How a file of another program's format is written."""
-        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy)
+        return Writing(self.spz_version, bool(self.antialiased), self.force_lossy, self.glb)
 
     @property
     def unseen_share(self) -> float:

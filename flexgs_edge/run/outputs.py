@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import check_writable
 from flexgs_edge.io.exchange import offset_place
 from flexgs_edge.io.formats import WRITTEN, Format, written_format
@@ -44,9 +44,19 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     return Output(Path(output), format)
 
 
+def check_smaller(size: int, input_bytes: int | None, options: CompressOptions) -> None:
+    """Raise `TargetError` if a result is larger than the file that came in. `--best-effort` writes it all the same."""
+    if input_bytes is not None and size > input_bytes and not options.best_effort:
+        method = " leave --method paper out," if options.method == "paper" else ""
+        raise TargetError(
+            f"the result would have {size} bytes, and the input has {input_bytes}: nothing was written. Keep the input, or"
+            f"{method} ask for less: --max-size {input_bytes}, or a larger --max-drop. --best-effort writes it all the same"
+        )
+
+
 def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOptions) -> Format | None:
     """The format that `-o` asks for, if the options fit it; `None` for `.fgs`."""
-    format = None if output is None else written_format(output)
+    format = None if output is None else written_format(output, options.writing)
     if format is None:
         if options.recenter or options.force_lossy:
             word = "recenter" if options.recenter else "force-lossy"

@@ -14,6 +14,7 @@ from flexgs_edge.io.exchange import MovedSource, check_positions
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import LOG, SILENT, Progress
+from flexgs_edge.run.background import Colour, contrasting_background
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.inputs import (
     CheckedScene,
@@ -48,6 +49,7 @@ class Run(Generic[Options]):
     reporter: Reporter | None = None  # gathers the pages of `--report`
     output: Output = NO_OUTPUT  # the file that `compress` writes
     judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
+    background: Colour | None = None  # before which views are compared, if it is not that of the options
     warnings: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
 
     @property
@@ -137,7 +139,18 @@ def open_compression(
     reporter = Reporter.maybe(options.report, options.force)
     run = replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
     with run.clock.stage("open"):
+        if options.background is None and run.views is not None and run.views.photos is None:
+            run = _standing_out(run, run.views)
         return _positioned(run)
+
+
+def _standing_out(run: Run[CompressOptions], views: ViewSet) -> Run[CompressOptions]:
+    """The same run before a background that the scene stands out from."""
+    assert run.options.background is not None
+    background, note = contrasting_background(run.source, run.options.background)
+    if note is None:
+        return run
+    return replace(run, background=background, views=replace(views, notes=(*views.notes, note)))
 
 
 def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:

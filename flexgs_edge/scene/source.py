@@ -46,6 +46,7 @@ class SceneSource(ABC):
     # Bytes of all files that the scene was read from, if there are several. `None`: the size of its only file.
     file_bytes: int | None = None
     version: int | None = None  # version of the format that the file states
+    doubles: bool | None = None  # positions came as float64; `None`: the file does not tell
     whole: int | None = None  # Gaussians of the scene that a cut file is a part of
 
     @abstractmethod
@@ -236,7 +237,7 @@ class WrappedSource(SceneSource):
         self.sh_degree, self.sh_count, self.valid = parent.sh_degree, parent.sh_count, parent.valid
         # Without comments: these values do not lie on the grid that they may name.
         self.settings, self.held_bytes = parent.settings, parent.held_bytes
-        self.file_bytes, self.version = parent.file_bytes, parent.version
+        self.file_bytes, self.version, self.doubles = parent.file_bytes, parent.version, parent.doubles
 
 
 class SelectSource(WrappedSource):

@@ -13,7 +13,7 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.score import score_gaussians
-from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.open_scene import open_scene
@@ -124,3 +124,22 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
     result = compress(tmp_path / "bad.ply", tmp_path / "a.fgs", drop_invalid=True, **words)
     assert result.scene.count == COUNT - 3 and "3 of 400 Gaussians left out" in result.summary()
     assert info(tmp_path / "a.fgs").settings["source_count"] == COUNT
+
+
+@pytest.mark.parametrize("method", ["best", "paper"])
+def test_a_result_larger_than_its_input_is_not_written(
+    tmp_path: Path, done: tuple[Path, CompressResult], project: Path, method: str
+) -> None:
+    small = compress(project, tmp_path / "small.fgs", max_size=4000, **FAST).size
+    words: dict[str, Any] = {**FAST, "method": method, "cameras": str(project / "cameras.json"), "images": "none"}
+    finer = (
+        {"min_fidelity": 60.0}
+        if method == "best"
+        else {"prune_rate": 0.0, "sh_rate": 0.0, "bits": "dc=16,scale=16,rot=16,opacity=16"}
+    )
+    found = rf"the result would have \d+ bytes, and the input has {small}: nothing was written\. Keep the input, or"
+    with pytest.raises(TargetError, match=found):
+        compress(tmp_path / "small.fgs", tmp_path / "larger.fgs", **words, **finer)
+    assert [file.name for file in tmp_path.iterdir()] == ["small.fgs"]
+    larger = compress(tmp_path / "small.fgs", tmp_path / "larger.fgs", best_effort=True, **words, **finer)
+    assert larger.size > small and "keep the input" in larger.warnings[-1]

@@ -11,20 +11,23 @@ import numpy as np
 import pytest
 
 from flexgs_edge.io.exchange import read_foreign, write_foreign
+from flexgs_edge.io.gltf import EXTENSION
 from flexgs_edge.io.ply import write_ply
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.rotations import matrices, normalize_quats
 from flexgs_edge.scene.source import MemorySource, Planes
 from synthetic import random_scene
 
 SCRIPT = Path(__file__).with_name("load_glb.mjs")
+SPZ_SCRIPT = Path(__file__).with_name("load_glb_spz.mjs")
 COUNT = 100
 
 
-def loaded(modules: Path, path: Path) -> dict[str, Any]:
+def loaded(modules: Path, path: Path, script: Path = SCRIPT) -> dict[str, Any]:
     """What the programs read."""
     done = subprocess.run(
-        ["node", str(SCRIPT), str(modules), str(path)], capture_output=True, text=True, timeout=120, check=False
+        ["node", str(script), str(modules), str(path)], capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -128,3 +131,37 @@ def test_splat_transform_writes_what_we_read(node_modules: Path, scene: MemorySo
         np.testing.assert_allclose(a[name], b[name], atol=2e-5, err_msg=name)
     # It turns the rotations, we also turn each Gaussian's own axes: the same covariances.
     np.testing.assert_allclose(covariances(a), covariances(b), atol=1e-4)
+
+
+def test_cesium_reads_the_spz_inside(node_modules: Path, scene: MemorySource, tmp_path: Path) -> None:
+    if not (node_modules / "@cesium").is_dir():
+        pytest.skip("no CesiumJS: deploy/test.sh installs it")
+    far = MemorySource(scene.read(slice(0, COUNT), list(FIELD)), origin=np.array([5e5, 0, -300]))
+    write_foreign(tmp_path / "a.glb", far, writing=Writing(glb="spz"))
+    theirs = loaded(node_modules, tmp_path / "a.glb", SPZ_SCRIPT)
+    assert theirs["matrix"] == [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, -5e5, 0, -300, 1]
+    back = read_foreign(tmp_path / "a.glb")
+    ours = back.read(slice(0, COUNT), list(FIELD))
+    ours["means"] += (back.origin - far.origin)[:, None]
+    # It takes the values as the .spz has them: half a turn about y away from what the extension's text wants.
+    turn = np.array([1, -1, -1])
+    columns = {
+        name.removeprefix(f"{EXTENSION}:"): np.reshape(values, (COUNT, -1)).T
+        for name, values in theirs.items()
+        if name != "matrix"
+    }
+    np.testing.assert_allclose(columns["POSITION"] * turn[:, None], ours["means"], atol=1e-6)
+    np.testing.assert_allclose(np.log(columns["SCALE"]), ours["log_scales"], atol=1e-5)
+    colours = np.concatenate([ours["sh_dc"] * 0.28209479 + 0.5, 1 / (1 + np.exp(-ours["opacity_logits"]))])
+    assert np.abs(columns["COLOR_0"] - 255 * np.clip(colours, 0, 1)).max() < 1.01
+    quats = columns["ROTATION"][[3, 0, 1, 2]] * np.array([1, *turn])[:, None]
+    np.testing.assert_allclose(np.abs((quats * ours["quats"]).sum(axis=0)), 1, atol=1e-5)
+    rest = ours["sh_rest"].reshape(3, 15, COUNT)
+    # Functions odd in an odd number of y and z.
+    odd = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1]
+    places = [(1, 3, 0), (2, 5, 3), (3, 7, 8)]
+    for degree, count, start in places:
+        for number in range(count):
+            found = columns[f"SH_DEGREE_{degree}_COEF_{number}"]
+            expected = rest[:, start + number] * odd[start + number]
+            np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=f"{degree} {number}")

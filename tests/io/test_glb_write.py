@@ -15,7 +15,8 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.formats import FORMATS
 from flexgs_edge.io.glb_writer import write_glb
-from flexgs_edge.io.reading import PLAIN
+from flexgs_edge.io.gltf import SPZ_EXTENSIONS
+from flexgs_edge.io.reading import PLAIN, Writing
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import MemorySource, Planes, SceneSource
@@ -79,6 +80,31 @@ def test_what_the_file_says(tmp_path: Path) -> None:
     assert np.abs(colours[3] - opacities).max() <= 0.5 + 1e-9
     assert start + sum(view["byteLength"] for view in record["bufferViews"]) == len(data)
     assert all(view["byteOffset"] % 4 == 0 for view in record["bufferViews"])
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_spz_inside(tmp_path: Path, degree: int) -> None:
+    planes = random_scene(300, seed=6, degree=degree).read(slice(0, 300), list(FIELD))
+    source = MemorySource(planes, origin=np.array([0, 7e5, 0]))
+    writing = Writing(antialiased=True, glb="spz")
+    assert write_foreign(tmp_path / "a.glb", source, writing=writing) == ()
+    write_foreign(tmp_path / "plain.glb", source)
+    write_foreign(tmp_path / "a.spz", MemorySource(planes), writing=writing)
+    back, alone = read_foreign(tmp_path / "a.glb"), read_foreign(tmp_path / "a.spz")
+    assert back.notes == () and dict(back.settings) == {"antialiased": True} and back.sh_degree == degree
+    ours, theirs = alone.read(slice(0, 300), list(FIELD)), back.read(slice(0, 300), list(FIELD))
+    theirs["means"] += (back.origin - source.origin).astype(np.float32)[:, None]
+    for name in FIELD:
+        np.testing.assert_array_equal(theirs[name], ours[name], err_msg=name)
+    record = glb_record(tmp_path / "a.glb")
+    extensions = [EXTENSION, SPZ_EXTENSIONS[0]]
+    assert record["extensionsUsed"] == record["extensionsRequired"] == extensions
+    (primitive,) = record["meshes"][0]["primitives"]
+    assert primitive["extensions"][EXTENSION]["extensions"] == {SPZ_EXTENSIONS[0]: {"bufferView": 0}}
+    assert not any("bufferView" in accessor for accessor in record["accessors"])
+    assert len(primitive["attributes"]) == len(record["accessors"]) == 4 + (degree + 1) ** 2 - 1
+    assert (tmp_path / "a.glb").stat().st_size < (tmp_path / "plain.glb").stat().st_size / 2
+    assert (tmp_path / "a.glb").stat().st_size % 4 == 0
 
 
 class InChunks(MemorySource):

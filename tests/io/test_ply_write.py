@@ -9,8 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.io.exchange import wants_double
+from flexgs_edge.io.frames import RUB, in_frame
 from flexgs_edge.io.ply import PlySource, inria_dtype, write_ply
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource
 from scene_files import header, property_names, random_rows, write_rows
@@ -56,13 +60,39 @@ def test_the_sample_comes_back_byte_for_byte(tmp_path: Path, chunk_rows: int) ->
 
 def test_a_scene_far_from_zero_is_written_in_float64(tmp_path: Path) -> None:
     source = scene(50, 1, origin=(4e6, -5e5, 0.0))
-    notes = write_ply(tmp_path / "a.ply", source)
-    assert notes == ("positions written as double: the scene is far from zero (origin 4e+06, -500000, 0)",)
+    assert write_ply(tmp_path / "a.ply", source, double=True) == ("positions written as double",)
     assert b"property double x\n" in (tmp_path / "a.ply").read_bytes()
     back = PlySource(tmp_path / "a.ply")
     expected = source.read(slice(0, 50), ["means"])["means"] + source.origin[:, None]
     found = back.read(slice(0, 50), ["means"])["means"] + back.origin[:, None]
     assert np.abs(found - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("shift", [0, 4e6])
+@pytest.mark.parametrize("double", ["", "x"])
+def test_the_type_that_comes_in_goes_out(tmp_path: Path, shift: float, double: str) -> None:
+    rows = random_rows(50, 0, double=double)
+    rows["x"] += shift
+    path = write_rows(tmp_path / "a.ply", rows)
+    # One chosen row after another, turned and back: what wraps a source keeps what came in.
+    source = in_frame(in_frame(PlySource(path), RUB), RUB).select(np.arange(50))
+    assert wants_double(source) == (bool(double), ())
+    decompress(path, tmp_path / "b.ply", writing=Writing(double=True))
+    assert b"property double z\n" in (tmp_path / "b.ply").read_bytes()
+    with pytest.raises(InputError, match=r"--double: only a \.ply .*not \.spz"):
+        decompress(path, tmp_path / "b.spz", writing=Writing(double=True))
+
+
+def test_unknown_types_are_floats_where_these_hold(tmp_path: Path) -> None:
+    planes = scene(50, 1).read(slice(0, 50), ALL)
+    planes["log_scales"][:] = -4.0
+    near = MemorySource(planes, origin=np.array([1000.0, 0, 0]))
+    assert wants_double(near) == (False, ())
+    planes["log_scales"][:, 7] = -9.0
+    double, (words,) = wants_double(MemorySource(planes, origin=np.array([4000.0, 0, 0])))
+    expected = "floats hold positions of this scene only to 0.00012, and the smallest splat measures 0.00012: --double "
+    assert not double and words.startswith(expected)
+    assert wants_double(MemorySource(planes, origin=np.array([4e6, 0, 0]))) == (True, ())
 
 
 def test_floats_far_from_zero_come_back_as_floats(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.io.ply import PlySource, write_ply
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
@@ -68,7 +69,7 @@ def scene() -> MemorySource:
 )
 def test_it_reads_what_we_write(node_modules: Path, tmp_path: Path, scene: MemorySource, name: str) -> None:
     write_ply(tmp_path / "scene.ply", scene)
-    decompress(tmp_path / "scene.ply", tmp_path / name, spz_version=4 if name == "four.spz" else 3)
+    decompress(tmp_path / "scene.ply", tmp_path / name, writing=Writing(4 if name == "four.spz" else 3))
     transform(node_modules, tmp_path / name, tmp_path / "theirs.ply")
     assert_alike(open_scene(tmp_path / name), PlySource(tmp_path / "theirs.ply"))
 

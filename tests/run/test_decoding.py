@@ -12,6 +12,7 @@ from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands import decompress as command
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import BudgetError
+from flexgs_edge.io.reading import Writing
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss
@@ -56,9 +57,9 @@ def test_a_scene_that_does_not_fit_decoded_has_room_for_its_decoding(file: Path)
 def test_other_formats_have_the_same_bytes_either_way(
     suffix: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    decompress(file, tmp_path / f"once{suffix}", force_lossy=True, cameras="none")
+    decompress(file, tmp_path / f"once{suffix}", writing=Writing(force_lossy=True), cameras="none")
     monkeypatch.setattr(command, "decoded_once", lambda source, *_: source)
-    decompress(file, tmp_path / f"again{suffix}", force_lossy=True, cameras="none")
+    decompress(file, tmp_path / f"again{suffix}", writing=Writing(force_lossy=True), cameras="none")
     assert (tmp_path / f"once{suffix}").read_bytes() == (tmp_path / f"again{suffix}").read_bytes()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -23,7 +25,8 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
 
-DONE = "done"  # File that is written last. A round without it was cut short.
+DONE = "done"  # File that is written last, with the checksums of all others. A round without it was cut short.
+READ_BYTES = 1 << 20
 
 
 class Checkpoint:
@@ -34,14 +37,23 @@ class Checkpoint:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
+        self._sound: set[int] = set()  # rounds whose files were checked, or written by this run
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
             raise InputError(f"{self.folder}: cannot keep the state of the run there ({error.strerror})") from error
 
     def has(self, number: int) -> bool:
-        """Whether round `number` was finished."""
-        return (self._place(number) / DONE).is_file()
+        """Whether round `number` was finished, and its files are as they were written. A damaged one is removed."""
+        place = self._place(number)
+        if number not in self._sound and (place / DONE).is_file():
+            damaged = _damaged(place)
+            if damaged is None:
+                self._sound.add(number)
+            else:
+                LOG.warning("%s is damaged: that round of the search is computed anew", damaged)
+                shutil.rmtree(place, ignore_errors=True)
+        return number in self._sound
 
     @property
     def key(self) -> str:
@@ -57,21 +69,9 @@ class Checkpoint:
         return number
 
     def load(self, number: int, storage: Storage) -> dict[str, np.ndarray]:
-        """The arrays of a finished round, by name, in `storage`.
-
-        Raises `InputError` when a file is damaged.
-        """
-        arrays = {}
-        for place in sorted(self._place(number).glob("*.npy")):
-            try:
-                held = np.load(place, mmap_mode="r", allow_pickle=False)
-            except (ValueError, EOFError) as error:
-                raise InputError(
-                    f"{place}: expected an array of a finished round, found something else ({error}); delete {self.folder} "
-                    "to begin anew"
-                ) from error
-            arrays[place.stem] = storage.copy(held)
-        return arrays
+        """The arrays of a round that `has` found, by name, in `storage`."""
+        places = sorted(self._place(number).glob("*.npy"))
+        return {place.stem: storage.copy(np.load(place, mmap_mode="r", allow_pickle=False)) for place in places}
 
     def save(self, number: int, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
         """Save a round. Remains of an earlier run are written over.
@@ -92,7 +92,9 @@ class Checkpoint:
                             file.write(np.ascontiguousarray(read_rows(plane, rows)).data)
                     file.flush()
                     os.fsync(file.fileno())
-            (place / DONE).touch()
+            sums = {file.name: _checksum(file) for file in place.iterdir()}
+            (place / DONE).write_text(json.dumps(sums), encoding="utf-8")
+            self._sound.add(number)
         except OSError as error:
             if error.errno not in DISK_FULL:
                 raise
@@ -107,6 +109,25 @@ class Checkpoint:
 
     def _place(self, number: int) -> Path:
         return self.folder / f"round-{number}"
+
+
+def _checksum(path: Path) -> int:
+    """CRC-32 of a file."""
+    found = 0
+    with open(path, "rb") as file:
+        while block := file.read(READ_BYTES):
+            found = zlib.crc32(block, found)
+    return found
+
+
+def _damaged(place: Path) -> Path | None:
+    """A file of a finished round that is missing, or not as it was written; `None` if all are."""
+    try:
+        sums = json.loads((place / DONE).read_text(encoding="utf-8"))
+        wrong = [name for name, found in sums.items() if _checksum(place / name) != found]
+        return place / min(wrong) if wrong else None
+    except (OSError, ValueError, AttributeError, TypeError):
+        return place
 
 
 def open_checkpoint(

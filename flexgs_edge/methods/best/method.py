@@ -40,6 +40,7 @@ from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings, settings_room
@@ -89,6 +90,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
             with temporary_name(output, run.options.force, None if kept is None else kept.key) as place:
                 with run.clock.stage("write"):
                     size = coder.write(place, grid, settings, preview)
+                check_smaller(size, run.scene.file_bytes, run.options)
                 limit = run.target.limit_bytes
                 if search.reached and limit is not None and size > limit:
                     raise TargetError(
@@ -234,7 +236,7 @@ def search_best(
             found = search(
                 make(rounds, measure, see if options.makes_poses else None),
                 target,
-                best_effort=options.best_effort,
+                best_effort=options.takes_closest,
                 on_step=lambda step: LOG.info("%s", step_words(as_step(step, source.count), target)),
             )
     finally:

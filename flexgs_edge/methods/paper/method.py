@@ -26,6 +26,7 @@ from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
@@ -135,7 +136,7 @@ def _search(run: Run[CompressOptions], evaluator: SceneEvaluator) -> SearchResul
     def said(step: Step) -> None:
         LOG.info("%s", step_words(step, target))
 
-    return adapt(evaluator, target, options.effort, options.best_effort, said, run.source.count)
+    return adapt(evaluator, target, options.effort, options.takes_closest, said, run.source.count)
 
 
 def _write(
@@ -150,6 +151,7 @@ def _write(
     with temporary_name(output, run.options.force) as place:
         with run.clock.stage("write"):
             size = write_container(place, quantized, settings)
+        check_smaller(size, run.scene.file_bytes, run.options)
         quality = None
         if judges is not None:
             run.budget.take("the decoded file", size)

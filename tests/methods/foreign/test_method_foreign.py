@@ -108,6 +108,15 @@ def test_a_format_without_sh(project: Path, tmp_path: Path) -> None:
     assert result.size == 32 * result.count and result.sh_count == 0 and result.scene.sh_degree == 2
 
 
+def test_a_spz_inside_a_glb(project: Path, tmp_path: Path) -> None:
+    words = {**FAST, "max_drop": 2.0}
+    result = compress(project / "point_cloud.ply", tmp_path / "a.glb", glb="spz", **words)
+    spz = compress(project / "point_cloud.ply", tmp_path / "a.spz", **words)
+    assert result.reached and result.count == spz.count and 0 < result.size - spz.size < 4000
+    with pytest.raises(InputError, match="--glb draco: expected plain or spz"):
+        compress(project / "point_cloud.ply", tmp_path / "b.glb", glb="draco", **words)
+
+
 def test_without_writing(project: Path, tmp_path: Path, own_temporary_folder: Path) -> None:
     dry = compress(project / "point_cloud.ply", tmp_path / "a.spz", dry_run=True, max_drop=2.0, **FAST)
     assert dry.output is None and dry.format == "spz" and [p.name for p in tmp_path.iterdir()] == ["tmp"]
