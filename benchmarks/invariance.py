@@ -18,10 +18,11 @@ from unittest import mock
 
 import numpy as np
 
+from benchmarks.camera_files import inria_json
 from benchmarks.harness import SCENES, Timer, check
 from benchmarks.moved_scene import Similarity
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.read import inria_json, read_cameras
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.io.ply import PlySource, write_ply
@@ -84,7 +85,7 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
         result = compress(path, output, method="best", near=near, force=True, progress=progress, **words)
     assert result.search is not None
     chosen = next(step for step in steps if step.measurement == result.search.chosen.measurement)
-    rows = makers[0].rounds.scene_rows(makers[0].selection.kept(chosen.multiplier).rows)
+    rows = np.sort(makers[0].rounds.rows[makers[0].selection.kept(chosen.multiplier).rows])
     # A search trims a few of them.
     check(0.8 * len(rows) < result.count <= len(rows), "the rows of the file")
     return Found(makers[0], chosen.multiplier, np.sort(rows), result.size)
@@ -126,7 +127,7 @@ def compare(
     )
     first = compress_and_look(source.path, scratch / "first.fgs", DEFAULT_NEAR, progress, **words)
     second = compress_and_look(moved, scratch / "second.fgs", DEFAULT_NEAR * factor, progress, **words)
-    choice = second.maker.rounds.scene_rows(second.maker.selection.kept(first.multiplier).rows)
+    choice = np.sort(second.maker.rounds.rows[second.maker.selection.kept(first.multiplier).rows])
     note = f"{len(first.rows)} and {len(second.rows)} Gaussians, {first.size} and {second.size} bytes"
     return Likeness(_same(first.rows, second.rows), second.size / first.size, _same(first.rows, choice)), note
 

@@ -129,7 +129,6 @@ MUTATIONS = (
     constant("TRANSMITTANCE_MIN", "1e-5f", "pixels end at 1e-5"),
     constant("EXTENT_SLACK", "-0.01f", "ellipse too small"),
     constant("EXP2_POLY_5", "0.0f", "exp2 of degree 4"),
-    constant("SIGMA_RADIUS_INRIA", "2.5f", "2.5 sigma for --extent inria"),
     Mutation("no Jacobian clamp in x", "project.cl", "uc = smaller(larger(u, CAM(17)), CAM(18))", "uc = u"),
     Mutation("no Jacobian clamp in y", "project.cl", "vc = smaller(larger(v, CAM(19)), CAM(20))", "vc = v"),
     Mutation(

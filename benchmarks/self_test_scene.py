@@ -118,9 +118,9 @@ def draw_all(backend: Any) -> None:
     edges(backend)
     for degree in (0, 1, 2, 4):
         for_degree(backend, budget, degree)
-    for extent, antialiased, pairs in (("inria", False, 1 << 8), ("exact", True, 1), ("inria", True, PAIRS)):
+    for antialiased, pairs in ((False, 1 << 8), (True, 1), (True, PAIRS)):
         small = scene(60, 1, 9, opacity=-1)
-        drawer = Renderer(backend, budget, 0.3, (0.3, 0.0, 0.9), extent, antialiased, Fit(pairs=pairs, chunk_rows=37))
+        drawer = Renderer(backend, budget, 0.3, (0.3, 0.0, 0.9), antialiased, Fit(pairs=pairs, chunk_rows=37))
         view = camera(40, 35, -0.2, 3.0)
         with drawer.load(small) as loaded:
             drawer.render_planes(loaded, view)

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.camera_files import inria_json
 from benchmarks.parts import MOST_PARTS, PartsSource
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.read import inria_json, read_cameras
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.run.inputs import companions_of, load_scene

@@ -19,7 +19,7 @@ from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.methods.best.refit.finetune import COURSE, STRUCTURE, rates_for
+from flexgs_edge.methods.best.refit.finetune import STRUCTURE, Schedule, rates_for
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
@@ -121,7 +121,7 @@ def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: 
     """Time gradients of all values, and steps along them, relative to drawing the same views, in processor time."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     planes = source.read(slice(0, source.count), list(FIELD))
-    rates = rates_for(cameras, COURSE.means_rate)
+    rates = rates_for(cameras, Schedule.means_rate)
     with renderer.load(source) as scene:
         targets = [(0.9 * renderer.render_planes(scene, camera)).astype(np.float16) for camera in chosen]
         drawn = [

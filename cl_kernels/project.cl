@@ -14,7 +14,6 @@ __kernel void project(
     const uint base,                        // row of the view that the part starts at
     const uint first,                       // place of its first block in `blocks`
     const int degree,                       // SH degree of the chunk
-    const int inria_extent,                 // 1: tiles of ceil(3 sigma), 0: the exact ellipse of alpha >= ALPHA_MIN
     const int antialiased,                  // 1: opacity times sqrt(det before / det after the dilation)
     __global const uint *blocks,            // blocks of the chunk, ascending
     __global const float *camera,           // [32]
@@ -87,18 +86,10 @@ __kernel void project(
   FW t2 = larger(level2, (FW)0.0f);
   FW half_width = sqrt(t2 * a), half_height = sqrt(t2 * c);
   FW width = CAM(24), height = CAM(25);
-  FW reach_x = half_width, reach_y = half_height, radius = (FW)0.0f;
-  if (inria_extent) {
-    FW mid = (FW)0.5f * (a + c);
-    FW spread = sqrt(fmax((FW)0.1f, mid * mid - det));
-    radius = ceil((FW)SIGMA_RADIUS_INRIA * sqrt(mid + spread));
-    reach_x = radius + (FW)TILE;  // rounded out to whole tiles below
-    reach_y = reach_x;
-  }
   // Written so that NaN and infinity fail all tests.
   shown &= MASK(det > (FW)0.0f) & MASK(det < (FW)INFINITY) & MASK(a < (FW)INFINITY) & MASK(c < (FW)INFINITY);
-  shown &= MASK(mx + reach_x >= (FW)-1.0f) & MASK(mx - reach_x <= width);
-  shown &= MASK(my + reach_y >= (FW)-1.0f) & MASK(my - reach_y <= height);
+  shown &= MASK(mx + half_width >= (FW)-1.0f) & MASK(mx - half_width <= width);
+  shown &= MASK(my + half_height >= (FW)-1.0f) & MASK(my - half_height <= height);
 
   FW inv = quotient((FW)1.0f, det);
   FW k = inv * (FW)(0.5f * LOG2_E);  // exponents are powers of two
@@ -117,23 +108,15 @@ __kernel void project(
   out[12] = ic;
   out[13] = det * ic;
   out[14] = t2;
-  out[15] = radius;
+  out[15] = (FW)0.0f;  // fills the record
 
-  FW x0, x1, y0, y1;  // tiles of the bounding box, inclusive
-  if (inria_extent) {
-    x0 = floor((mx - radius) * (FW)(1.0f / TILE));
-    x1 = floor((mx + radius + (FW)(TILE - 1)) * (FW)(1.0f / TILE)) - (FW)1.0f;
-    y0 = floor((my - radius) * (FW)(1.0f / TILE));
-    y1 = floor((my + radius + (FW)(TILE - 1)) * (FW)(1.0f / TILE)) - (FW)1.0f;
-  } else {
-    // Twice the slack of the spans in tiles.cl, since this bound sets the size of the pair buffer.
-    FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-    FW sy = fma(half_height, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-    x0 = round_down(round_up(near_image(mx - half_width - sx, width)) * (FW)(1.0f / TILE));
-    x1 = round_down(round_down(near_image(mx + half_width + sx, width)) * (FW)(1.0f / TILE));
-    y0 = round_down(round_up(near_image(my - half_height - sy, height)) * (FW)(1.0f / TILE));
-    y1 = round_down(round_down(near_image(my + half_height + sy, height)) * (FW)(1.0f / TILE));
-  }
+  // Tiles of the bounding box, inclusive: twice the slack of the spans in tiles.cl, since this sets the size of the pair buffer.
+  FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+  FW sy = fma(half_height, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
+  FW x0 = round_down(round_up(near_image(mx - half_width - sx, width)) * (FW)(1.0f / TILE));
+  FW x1 = round_down(round_down(near_image(mx + half_width + sx, width)) * (FW)(1.0f / TILE));
+  FW y0 = round_down(round_up(near_image(my - half_height - sy, height)) * (FW)(1.0f / TILE));
+  FW y1 = round_down(round_down(near_image(my + half_height + sy, height)) * (FW)(1.0f / TILE));
   FW last_x = round_down((width - (FW)1.0f) * (FW)(1.0f / TILE)), last_y = round_down((height - (FW)1.0f) * (FW)(1.0f / TILE));
   x0 = larger(x0, (FW)0.0f);
   y0 = larger(y0, (FW)0.0f);

@@ -48,11 +48,7 @@ inline int tile_row(float y, float height) {
 }
 
 // First and last row of tiles that a splat may reach; none if the first is beyond the last.
-inline int2 rows_of_tiles(__global const float *r, float height, int inria_extent, int tiles_y) {
-  if (inria_extent) {
-    const int y0 = (int)fmax(floor((r[1] - r[15]) * (1.0f / TILE)), 0.0f);
-    return (int2)(y0, (int)fmin(floor((r[1] + r[15] + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_y - 1)));
-  }
+inline int2 rows_of_tiles(__global const float *r, float height) {
   const float slack = fma(r[10], SPAN_SLACK_RELATIVE, SPAN_SLACK);
   return (int2)(tile_row(r[1] - r[10] - slack, height), tile_row(r[1] + r[10] + slack, height));
 }
@@ -60,12 +56,7 @@ inline int2 rows_of_tiles(__global const float *r, float height, int inria_exten
 // Calls EACH(tile, mask) for every tile in which the splat of record `r` may show, in BANDS / 4 rows of tiles from `top` on, of those up
 // to `ty1`.
 #define FOR_EACH_TILE(r, top, ty1, EACH)                                                                        \
-  if (inria_extent) {                                                                                           \
-    const int x0 = (int)fmax(floor((r[0] - r[15]) * (1.0f / TILE)), 0.0f);                                      \
-    const int x1 = (int)fmin(floor((r[0] + r[15] + (TILE - 1)) * (1.0f / TILE)) - 1.0f, (float)(tiles_x - 1));  \
-    for (int ty = top; ty <= ty1 && ty < top + BANDS / 4; ++ty)                                                 \
-      for (int tx = x0; tx <= x1; ++tx) EACH(ty * tiles_x + tx, 0xFFFFu);                                       \
-  } else {                                                                                                      \
+  {                                                                                                             \
     int first[BANDS], last[BANDS];                                                                              \
     const int bands = min(BANDS, 4 * (ty1 - top + 1));                                                          \
     for (int v = 0; v < bands; v += W) {                                                                        \
@@ -123,7 +114,6 @@ __kernel LISTERS void tile_count(
     const uint count,
     const float width,                // pixels
     const float height,
-    const int inria_extent,
     __global const uint *ids,         // [shown]
     __global const float *records,    // [N, 16]
     __global uint *room,              // [2, blocks] see `tile_room`
@@ -149,7 +139,7 @@ __kernel LISTERS void tile_count(
   for (uint from_splat = start; from_splat < end; from_splat += LIST_GROUP) {
     // Rows of tiles of each splat, and of those up to it.
     int2 span = (int2)(0, -1);
-    if (from_splat + p < end) span = rows_of_tiles(records + (size_t)ids[from_splat + p] * 16, height, inria_extent, tiles_y);
+    if (from_splat + p < end) span = rows_of_tiles(records + (size_t)ids[from_splat + p] * 16, height);
     found[p] = (uint)max(span.s1 - span.s0 + 1, 0);
     barrier(CLK_LOCAL_MEM_FENCE);
     uint upto = 0;
@@ -167,7 +157,7 @@ __kernel LISTERS void tile_count(
           if (rows[splat + stride - 1] <= row) splat += stride;
         id = ids[from_splat + splat];
         r = records + (size_t)id * 16;
-        top = rows_of_tiles(r, height, inria_extent, tiles_y).s0 + (int)(row - (splat ? rows[splat - 1] : 0u));
+        top = rows_of_tiles(r, height).s0 + (int)(row - (splat ? rows[splat - 1] : 0u));
         FOR_EACH_TILE(r, top, top, COUNT_PAIR)
       }
       found[p] = mine;
@@ -192,7 +182,7 @@ __kernel LISTERS void tile_count(
   for (uint n = start; n < end; ++n) {
     FETCH(records + (size_t)ids[min(n + AHEAD, end - 1)] * 16);
     __global const float *r = records + (size_t)ids[n] * 16;
-    const int2 span = rows_of_tiles(r, height, inria_extent, tiles_y);
+    const int2 span = rows_of_tiles(r, height);
     for (int top = span.s0; top <= span.s1; top += BANDS / 4) {
       FOR_EACH_TILE(r, top, span.s1, DRAFT_PAIR)
     }

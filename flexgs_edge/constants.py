@@ -41,7 +41,6 @@ FACTOR_MIN: Final = 1e-30
 JACOBIAN_MARGIN: Final = 0.15
 """The Jacobian is taken at a point clamped to the image plus this share of its width (height) on each side. For a
 centred principal point, that is 1.3 times the half field of view."""
-SIGMA_RADIUS_INRIA: Final = 3.0  # Sigmas of `--extent inria`: a splat reaches ceil(3 sigma), rounded out to whole tiles
 
 # --- blending (reference rasteriser) ----------------------------------------------------------
 ALPHA_MIN: Final = 1.0 / 255.0  # A splat with an alpha below one 8-bit step at a pixel is skipped there

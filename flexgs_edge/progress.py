@@ -1,12 +1,14 @@
-"""Progress bars on stderr for long work. All bars go through here, so that quiet runs and pipes show none."""
+"""What is said while work goes on: the log, and progress bars on stderr, of which quiet runs and pipes show none."""
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 T = TypeVar("T")
+LOG = logging.getLogger("flexgs_edge")
 
 
 class Progress:

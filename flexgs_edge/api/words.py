@@ -43,7 +43,6 @@ class CompressWords(TypedDict, total=False):
     resolution: int
     near: float | None
     background: tuple[float, float, float] | None
-    extent: str | None
     antialiased: bool | None
     up: tuple[float, float, float] | None
     drop_invalid: bool

@@ -48,22 +48,13 @@ Drawing = Callable[[dict[str, np.ndarray]], AbstractContextManager[Show]]
 
 @dataclass(frozen=True)
 class Rig:
-    """Automatic cameras.
+    """Automatic cameras."""
 
-    Attributes
-    ----------
-    cameras : list of Camera
-        World coordinates, named auto_000, auto_001, ... Every `DEFAULT_HOLDOUT`-th one lies between others. The rest
-        are in order of what they add.
-    near : float
-        Scene units: a larger near plane would cut off what the views show.
-    note : str
-        How the cameras were placed, for the summary.
-    """
-
+    # World coordinates, named auto_000, auto_001, ... Every `DEFAULT_HOLDOUT`-th one lies between others. The rest
+    # are in order of what they add.
     cameras: list[Camera]
-    near: float
-    note: str
+    near: float  # Scene units: a larger near plane would cut off what the views show
+    note: str  # How the cameras were placed, for the summary
 
 
 def automatic_rig(
@@ -76,23 +67,10 @@ def automatic_rig(
 ) -> Rig:
     """Place cameras for a scene that has none; the same scene always gets the same cameras.
 
-    Parameters
-    ----------
-    source : SceneSource
-        Checked: finite and not empty.
-    drawing : callable
-        Draws candidates.
-    views : int, optional
-        Number of cameras. Default: as many as the scene needs.
-    width, height : int, optional
-        Pixels.
-    up : np.ndarray, optional
-        [3], the direction of up in the scene's frame, of any length but zero. Default: what the scene itself tells, else -y.
-
-    Raises
-    ------
-    InputError
-        If less than one view is asked for.
+    `source`: checked: finite and not empty. `drawing`: draws candidates. `views`: number of cameras. Default: as
+    many as the scene needs. `width`, `height`: pixels. `up`: [3], the direction of up in the scene's frame, of any
+    length but zero. Default: what the scene itself tells, else -y. Raises `InputError` if less than one view is
+    asked for.
     """
     if views is not None and views < 1:
         raise InputError(f"{views} automatic views: expected at least 1")

@@ -73,31 +73,17 @@ Show = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
 class Candidate:
     """A candidate and what its picture shows.
 
-    Attributes
-    ----------
-    at, line : np.ndarray
-        [3] f64, where it is, relative to the scene's origin, and where it looks.
-    step : float
-        Distance to other candidates, scene units.
-    sides : float
-        Share of all directions in which there is matter, about.
-    rows : np.ndarray
-        [m] int64, what it shows.
-    part : np.ndarray
-        [m] f64, how much of each, scene units squared.
-    close : np.ndarray
-        [m] f64, 0 to 1, how well their sizes in the view suit it.
-    clear, smear, blur, filled, distance : float
-        What its worth follows from; the usual distance of what it shows, scene units.
+    `at`, `line`: [3] f64, where it is, relative to the scene's origin, and where it looks. `clear`, `smear`,
+    `blur`, `filled`, `distance`: What its worth follows from; the usual distance of what it shows, scene units.
     """
 
     at: np.ndarray
     line: np.ndarray
-    step: float
-    sides: float
-    rows: np.ndarray
-    part: np.ndarray
-    close: np.ndarray
+    step: float  # Distance to other candidates, scene units
+    sides: float  # Share of all directions in which there is matter, about
+    rows: np.ndarray  # [m] int64, what it shows
+    part: np.ndarray  # [m] f64, how much of each, scene units squared
+    close: np.ndarray  # [m] f64, 0 to 1, how well their sizes in the view suit it
     clear: float
     smear: float
     blur: float

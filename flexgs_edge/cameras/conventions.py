@@ -17,24 +17,12 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Convention:
-    """Another meaning of the poses in a camera file.
+    """Another meaning of the poses in a camera file."""
 
-    Parameters
-    ----------
-    words : str
-        What it is, as the end of the sentence "the cameras fit if ...".
-    turn : np.ndarray
-        [3, 3] f64, signed permutation from the world of the file to that of the scene.
-    opengl : bool
-        The cameras' own axes are OpenGL's (y up, looking along -z).
-    inverse : bool
-        Poses are world to camera where camera to world was read, or the other way round.
-    """
-
-    words: str
-    turn: np.ndarray
-    opengl: bool = False
-    inverse: bool = False
+    words: str  # What it is, as the end of the sentence "the cameras fit if ..."
+    turn: np.ndarray  # [3, 3] f64, signed permutation from the world of the file to that of the scene
+    opengl: bool = False  # The cameras' own axes are OpenGL's (y up, looking along -z)
+    inverse: bool = False  # Poses are world to camera where camera to world was read, or the other way round
 
     @property
     def signs(self) -> np.ndarray | None:

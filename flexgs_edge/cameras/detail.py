@@ -21,21 +21,9 @@ UNITS = 2.0**16
 def smears(means: np.ndarray, sizes: np.ndarray, low: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
     """Log of each size over the usual one in a box around it.
 
-    Parameters
-    ----------
-    means : np.ndarray
-        [3, n].
-    sizes : np.ndarray
-        [n], deviations.
-    low, side : np.ndarray, float
-        First corner and side of a cube. What lies outside is moved to its faces.
-
-    Returns
-    -------
-    logs : np.ndarray
-        [n] f64, whole numbers of 1 / `UNITS`.
-    place : np.ndarray
-        [n] int64, of each one along a curve on which neighbours in space are near each other.
+    `means`: [3, n]. `sizes`: [n], deviations. `low`, `side`: first corner and side of a cube. What lies outside is
+    moved to its faces. Returns the logs ([n] f64, whole numbers of 1 / `UNITS`), and the place of each
+    one ([n] int64) along a curve on which neighbours in space are near each other.
     """
     codes = _curve(means, low, side)
     order = np.argsort(codes, kind="stable")
@@ -62,12 +50,7 @@ def few_rows(areas: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
 
     Large ones stand for themselves. Of small ones some stay, the fewer the smaller they are, and all of these are alike large.
 
-    Returns
-    -------
-    rows : np.ndarray
-        [m] int64, ascending.
-    growth : np.ndarray
-        [m] f64, factors of the deviations, 1 or more.
+    Returns the rows ([m] int64, ascending) and their growth ([m] f64, factors of the deviations, 1 or more).
     """
     if areas.size <= most:
         return np.arange(areas.size), np.ones(areas.size)

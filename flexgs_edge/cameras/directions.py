@@ -42,12 +42,7 @@ class Frames:
 
     A frame is a circle of the image's area. What it misses in the corners and adds beside the image evens out.
 
-    Parameters
-    ----------
-    count : int
-        Number of directions.
-    cone : float
-        Half angle of a frame, radians.
+    `count`: number of directions. `cone`: half angle of a frame, radians.
     """
 
     def __init__(self, count: int, cone: float) -> None:

@@ -28,12 +28,7 @@ SPARSE = 0.5
 def first_places(scene: SceneSample, count: int) -> tuple[np.ndarray, np.ndarray]:
     """About `count` candidates in and around the parts of a scene.
 
-    Returns
-    -------
-    at : np.ndarray
-        [3, P] f64, positions relative to the scene's origin.
-    step : np.ndarray
-        [P] f64, distance to the next ones, scene units.
+    Returns positions relative to the scene's origin ([3, P] f64), and distances to the next ones ([P] f64, scene units).
     """
     boxes = _boxes(scene.parts)
     found = [_lattice(box, count / len(boxes)) for box in boxes]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,24 +47,6 @@ def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
     cameras = [_camera(Entry(f"{path}: camera {index}", entry)) for index, entry in enumerate(entries)]
     names = distinct_names([camera.name for camera in cameras])
     return [replace(camera, name=name) for camera, name in zip(cameras, names)]
-
-
-def inria_json(cameras: Sequence[Camera]) -> str:
-    """The text of INRIA's cameras.json, one camera a line; it has no place for principal points and distortion."""
-    entries = [
-        {
-            "id": number,
-            "img_name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.center.tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fy": camera.fy,
-            "fx": camera.fx,
-        }
-        for number, camera in enumerate(cameras)
-    ]
-    return "[\n" + ",\n".join(json.dumps(entry) for entry in entries) + "\n]\n"
 
 
 def _camera(entry: Entry) -> Camera:

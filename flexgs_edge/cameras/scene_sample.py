@@ -59,18 +59,10 @@ class Gaussians(Protocol):
 
 @dataclass(frozen=True)
 class Part:
-    """The box of some of the Gaussians: all of them, a dense core, or a cluster apart.
+    """The box of some of the Gaussians: all of them, a dense core, or a cluster apart."""
 
-    Attributes
-    ----------
-    middle : np.ndarray
-        [3] f64, opacity-weighted median.
-    half : np.ndarray
-        [3] f64, half the sides of the box from the 5 % to the 95 % quantile, and some deviations more.
-    """
-
-    middle: np.ndarray
-    half: np.ndarray
+    middle: np.ndarray  # [3] f64, opacity-weighted median
+    half: np.ndarray  # [3] f64, half the sides of the box from the 5 % to the 95 % quantile, and some deviations more
 
     @property
     def extent(self) -> float:
@@ -80,24 +72,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Splats:
-    """A sample of rows.
+    """A sample of rows."""
 
-    Attributes
-    ----------
-    means : np.ndarray
-        [3, n] f64.
-    opacity : np.ndarray
-        [n] f64.
-    deviations : np.ndarray
-        [3, n] f64, along the splat's axes.
-    turns : np.ndarray
-        [3, 3, n] f64, columns are the splat's axes.
-    """
-
-    means: np.ndarray
-    opacity: np.ndarray
-    deviations: np.ndarray
-    turns: np.ndarray
+    means: np.ndarray  # [3, n] f64
+    opacity: np.ndarray  # [n] f64
+    deviations: np.ndarray  # [3, n] f64, along the splat's axes
+    turns: np.ndarray  # [3, 3, n] f64, columns are the splat's axes
 
     @staticmethod
     def read(source: Gaussians, rows: np.ndarray) -> Splats:
@@ -114,48 +94,20 @@ class Splats:
 
 @dataclass(frozen=True)
 class SceneSample:
-    """A scene in small.
+    """A scene in small."""
 
-    Attributes
-    ----------
-    parts : list of Part
-        Boxes that cameras may stand in and around. The first is that of the whole scene.
-    sample : Splats
-        Every k-th row, at most SAMPLE_ROWS.
-    area : float
-        Cross-sections of all rows together, scene units squared.
-    unit : float
-        Scene units of one unit of `planes`.
-    planes : dict of np.ndarray
-        What is drawn, {field: [width, M] f32}, without view-dependent colour.
-    means : np.ndarray
-        [3, M] f64, where they are, scene units.
-    sizes : np.ndarray
-        [M] f64, geometric mean of the two largest deviations, before they grew to stand for others.
-    smear : np.ndarray
-        [M] f64, see `smears`.
-    stands : np.ndarray
-        [M] f64, for how many rows of the scene each stands.
-    telling : np.ndarray
-        [T] int64, those of them whose SH tell from where they were trained.
-    sh : np.ndarray
-        [3, K, T] f64, coefficients of degrees 1 to 3 over their root mean square over all directions.
-    share : float
-        Share of the rows that tell directions.
-    """
-
-    parts: list[Part]
-    sample: Splats
-    area: float
-    unit: float
-    planes: dict[str, np.ndarray]
-    means: np.ndarray
-    sizes: np.ndarray
-    smear: np.ndarray
-    stands: np.ndarray
-    telling: np.ndarray
-    sh: np.ndarray
-    share: float
+    parts: list[Part]  # Boxes that cameras may stand in and around. The first is that of the whole scene.
+    sample: Splats  # Every k-th row, at most SAMPLE_ROWS
+    area: float  # Cross-sections of all rows together, scene units squared
+    unit: float  # Scene units of one unit of `planes`
+    planes: dict[str, np.ndarray]  # What is drawn, {field: [width, M] f32}, without view-dependent colour
+    means: np.ndarray  # [3, M] f64, where they are, scene units
+    sizes: np.ndarray  # [M] f64, geometric mean of the two largest deviations, before they grew to stand for others
+    smear: np.ndarray  # [M] f64, see `smears`
+    stands: np.ndarray  # [M] f64, for how many rows of the scene each stands
+    telling: np.ndarray  # [T] int64, those of them whose SH tell from where they were trained
+    sh: np.ndarray  # [3, K, T] f64, coefficients of degrees 1 to 3 over their root mean square over all directions
+    share: float  # Share of the rows that tell directions
 
     @property
     def whole(self) -> Part:

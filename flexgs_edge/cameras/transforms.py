@@ -7,7 +7,6 @@ exported PLY.
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import posixpath
@@ -23,9 +22,9 @@ from flexgs_edge.cameras.lens import Lens
 from flexgs_edge.cameras.nerfstudio import FLIP, find_dataparser, rigid
 from flexgs_edge.cameras.photos import SUFFIXES, photo_size
 from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.progress import LOG
 from flexgs_edge.small_matrices import product
 
-LOG = logging.getLogger("flexgs_edge")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")  # Values of `camera_model` without a lens
 BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

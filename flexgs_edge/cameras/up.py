@@ -63,18 +63,10 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class Up:
-    """A direction, and where it comes from.
+    """A direction, and where it comes from."""
 
-    Attributes
-    ----------
-    direction : np.ndarray
-        [3] f64, of length 1.
-    reason : str
-        convention, ground, camera ring, ground and camera ring, or --up.
-    """
-
-    direction: np.ndarray
-    reason: str
+    direction: np.ndarray  # [3] f64, of length 1
+    reason: str  # convention, ground, camera ring, ground and camera ring, or --up
 
     @property
     def note(self) -> str:
@@ -84,21 +76,11 @@ class Up:
 
 @dataclass(frozen=True)
 class Stands:
-    """Where cameras probably stood, and the views that were chosen.
+    """Where cameras probably stood, and the views that were chosen."""
 
-    Attributes
-    ----------
-    at : np.ndarray
-        [3, P] f64, the best places.
-    strength : np.ndarray
-        [P] f64, what each shows.
-    forward : np.ndarray
-        [3, V] f64, directions of the chosen views.
-    """
-
-    at: np.ndarray
-    strength: np.ndarray
-    forward: np.ndarray
+    at: np.ndarray  # [3, P] f64, the best places
+    strength: np.ndarray  # [P] f64, what each shows
+    forward: np.ndarray  # [3, V] f64, directions of the chosen views
 
 
 def find_up(scene: SceneSample, stands: Stands) -> Up:

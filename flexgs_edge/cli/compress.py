@@ -45,8 +45,8 @@ More examples:
       the paper's method, for two targets; the second run reuses the scores
   flexgs-edge compress point_cloud.ply -o c.fgs --method paper --prune-rate 0.3 --sh-rate 0.4
       fixed rates, no search
-  flexgs-edge compress point_cloud.ply -o d.fgs --cluster local:2
-      draws views in two processes
+  flexgs-edge compress point_cloud.ply -o d.fgs --cluster tcp://10.0.0.5:8786
+      draws views on other machines, too
   flexgs-edge compress big.ply -o big.fgs --memory-limit 1GiB --scratch /data/tmp --resume
       for a scene larger than memory; goes on after an interruption
   flexgs-edge compress scans/ garden/ -o small/ --format .spz
@@ -143,9 +143,9 @@ Several scenes:
 @option(
     MACHINES,
     "--cluster",
-    metavar="ADDRESS|local:N",
-    help="Draw views in N processes here (local:N) or on a Dask cluster, such as tcp://HOST:8786. Needs "
-    "pip install 'flexgs-edge[cluster]'. The bytes stay the same.",
+    metavar="ADDRESS",
+    help="Draw views on the workers of a Dask cluster, such as tcp://HOST:8786. Needs pip install 'flexgs-edge[cluster]'. "
+    "The bytes stay the same.",
 )
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")
 @option(OUTPUT, "--format", metavar="SUFFIX", help="Format of the files in a folder OUT/, such as .spz. Default: .fgs.")
@@ -232,7 +232,7 @@ Several scenes:
     metavar="SPEC",
     default="paper",
     help="Bits of each value. paper: xyz=16,dc=8,scale=8,rot=8,opacity=4,rest=4. A list such as rest=3,dc=7: the others as in "
-    "paper. auto: searched. rtn8, rtn4, ...: as many for all values (a weak baseline).",
+    "paper. rtn8, rtn4, ...: as many for all values (a weak baseline).",
 )
 @option(
     METHOD,

@@ -12,8 +12,8 @@ import click
 class LazyGroup(click.Group):
     """A group that knows the names of its subcommands, and imports a subcommand only to run it.
 
-    `commands_from`: a package with one module per subcommand, each of which defines `command`; and the overview's line
-    for each name.
+    `commands_from`: a package with one module per subcommand, each of which defines `command`, or a module that defines
+    all subcommands; and the overview's line for each name.
     """
 
     def __init__(self, *args: Any, commands_from: tuple[str, Mapping[str, str]], **kwargs: Any) -> None:
@@ -26,7 +26,10 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self.lines:
             return None
-        command: click.Command = import_module(f"{self.package}.{cmd_name}").command
+        found = getattr(import_module(self.package), cmd_name, None)
+        command: click.Command = (
+            found if isinstance(found, click.Command) else import_module(f"{self.package}.{cmd_name}").command
+        )
         return command
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -31,7 +31,7 @@ def command(
 ) -> None:
     """Draw views of a scene as PNG files.
 
-    The files are named after the cameras. A .fgs says how it is drawn: near plane, background, extent and antialiasing.
+    The files are named after the cameras. A .fgs says how it is drawn: near plane, background and antialiasing.
     Options override that. The summary shows the median time of a view, without start-up and without writing files.
 
     \b

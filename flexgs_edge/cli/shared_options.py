@@ -150,13 +150,6 @@ drawing_options = stack(
     ),
     option(
         VIEWS,
-        "--extent",
-        type=click.Choice(["exact", "inria"]),
-        help="Pixels that a splat reaches. exact: where alpha >= 1/255. inria: whole tiles up to 3 sigma, slower. "
-        "Default: as the file says, else exact.",
-    ),
-    option(
-        VIEWS,
         "--antialiased/--no-antialiased",
         default=None,
         help="For models trained with antialiasing. Default: as the file or cfg_args says, else off.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -16,7 +15,7 @@ from flexgs_edge.io.exchange import write_offset
 from flexgs_edge.methods.best import method as best
 from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.inputs import ScenePlace, scene_info
@@ -30,8 +29,6 @@ from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.run.warnings import view_warnings
 from flexgs_edge.views.render_context import RenderContext
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 def compress(
@@ -119,7 +116,6 @@ def _result(run: Run[CompressOptions], context: RenderContext | None, made: Meth
         decision_views=plan.kind_of(plan.decide, views),
         search=search,
         promise=promise,
-        sensitivity=made.sensitivity,
         quality=made.quality,
         quality_views=plan.kind_of(plan.report, views),
         score_cache=options.score_cache if plan.needs_scores else None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_folder, check_writable
 from flexgs_edge.io.formats import format_of
 from flexgs_edge.memory.process import trim_heap
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.batch_result import BatchItem, BatchResult
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.batch import FGS, StrPath, check_place, output_names, output_suffix, scenes_of
@@ -23,8 +22,6 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.failure import INTERNAL, TRACEBACKS, failure_of
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, CompressOptions
 from flexgs_edge.run.outputs import check_output
-
-LOG = logging.getLogger("flexgs_edge")
 
 OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "cameras": (None, AUTO_CAMERAS, NO_CAMERAS),

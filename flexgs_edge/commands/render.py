@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import time
@@ -15,7 +14,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
@@ -25,8 +24,6 @@ from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import LIBRARY_BYTES
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
-
-LOG = logging.getLogger("flexgs_edge")
 
 PNG_LEVEL = 2
 """Effort of the PNG's compression: a fourth of the default's time, 8 to 21 % more bytes. docs/results/tuning.md#png_level"""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import logging
 import os
 import tempfile
 import threading
@@ -26,7 +25,7 @@ from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import far_contraction, quantize_scene
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
@@ -35,8 +34,6 @@ from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
 from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
-
-LOG = logging.getLogger("flexgs_edge")
 
 FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
 """Bits of a scene that is coded only to be looked at."""

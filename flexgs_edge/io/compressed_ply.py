@@ -50,16 +50,8 @@ _CHUNK_ROWS = 64 * CHUNK
 class CompressedPlySource(DecodedSource):
     """A compressed PLY: its words, decoded when they are read.
 
-    Parameters
-    ----------
-    name : str
-        The user's path, for messages.
-    ranges : dict of str to tuple
-        Two arrays [chunks, 3] f64 by field: least and largest values; colours are optional.
-    words : dict of str to np.ndarray
-        [N] u32 by property.
-    sh : np.ndarray
-        [N, width] u8.
+    `name`: the user's path, for messages. `ranges`: two arrays [chunks, 3] f64 by field: least and largest values;
+    colours are optional. `words`: [N] u32 by property. `sh`: [N, width] u8.
     """
 
     def __init__(
@@ -104,10 +96,7 @@ def _quats(words: np.ndarray) -> np.ndarray:
 def read_compressed_ply(path: Path, name: str, reading: Reading) -> CompressedPlySource:
     """Open a compressed PLY; see `Format.reader`.
 
-    Raises
-    ------
-    FormatError
-        If it breaks the format, or is another kind of PLY.
+    Raises `FormatError` if it breaks the format, or is another kind of PLY.
     """
     with open(path, "rb") as file:
         head = file.read(8)

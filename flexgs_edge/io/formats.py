@@ -38,51 +38,29 @@ def _logarithmic(means: np.ndarray, largest: float) -> np.ndarray:
 class Format:
     """A format.
 
-    Parameters
-    ----------
-    suffix : str
-        End of file names, with its dot; or a whole file name.
-    reader : str
-        `module:function` of `read(path, name, reading)`, which returns a source in the file's frame. `name` is the user's path.
-        Imported only when a file needs it, so start-up stays fast.
-    writer : str or None
-        `module:function` of `write(file, source, writing)`, which writes a source in the file's frame to an open binary file.
-        `None`: only read.
-    frame : Frame
-        Directions of the axes in files of this format.
-    reach : float
-        Largest coordinate that it holds, scene units.
-    position_error : callable
-        From positions [3, n] f64 and the largest coordinate of the scene to the largest errors [n] f64 of a coordinate, at least.
-    keeps_origin : bool
-        It holds the origin of a scene far from zero apart, in float64.
-    max_degree : int
-        Highest SH degree.
-    fixed_rows : bool
-        All rows take the same bytes: neither coarser values nor SH of zero save any.
-    row_bytes, sh_bytes : float
-        Bytes of a fixed row of SH degree 3, and of SH among them.
-    memory : int
-        Most bytes a Gaussian that writing and reading back hold.
-    marks_antialiased : bool
-        Whether its files can say that a model is antialiased.
-    needs : tuple of str
-        A module that reading and writing load, and the extra of this package that brings it; or nothing.
+    `row_bytes`, `sh_bytes`: Bytes of a fixed row of SH degree 3, and of SH among them.
     """
 
-    suffix: str
+    suffix: str  # End of file names, with its dot; or a whole file name
+    # `module:function` of `read(path, name, reading)`, which returns a source in the file's frame. `name` is the
+    # user's path. Imported only when a file needs it, so start-up stays fast.
     reader: str
+    # `module:function` of `write(file, source, writing)`, which writes a source in the file's frame to an open binary
+    # file. `None`: only read.
     writer: str | None = None
-    frame: Frame = RDF
-    reach: float = float("inf")
+    frame: Frame = RDF  # Directions of the axes in files of this format
+    reach: float = float("inf")  # Largest coordinate that it holds, scene units
+    # From positions [3, n] f64 and the largest coordinate of the scene to the largest errors [n] f64 of a coordinate,
+    # at least
     position_error: Callable[[np.ndarray, float], np.ndarray] = _as_float32
-    keeps_origin: bool = False
-    max_degree: int = 3
-    fixed_rows: bool = False
+    keeps_origin: bool = False  # It holds the origin of a scene far from zero apart, in float64
+    max_degree: int = 3  # Highest SH degree
+    fixed_rows: bool = False  # All rows take the same bytes: neither coarser values nor SH of zero save any
     row_bytes: float = 0.0
     sh_bytes: float = 0.0
-    memory: int = 512
-    marks_antialiased: bool = False
+    memory: int = 512  # Most bytes a Gaussian that writing and reading back hold
+    marks_antialiased: bool = False  # Whether its files can say that a model is antialiased
+    # A module that reading and writing load, and the extra of this package that brings it; or nothing
     needs: tuple[str, ...] = ()
 
     def read(self, path: Path, name: str, reading: Reading) -> Any:

@@ -34,7 +34,7 @@ _BLEND = "uuiiii" + "fff" + "bbbbb"
 
 KERNELS: dict[str, KernelSpec] = {
     "activate": KernelSpec("activate.cl", "uibbbbb", "rows"),
-    "project": KernelSpec("project.cl", "uuuuiiibbbbbbbbbb", "rows"),
+    "project": KernelSpec("project.cl", "uuuuiibbbbbbbbbb", "rows"),
     "sort_count_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_scatter_first": KernelSpec("sort.cl", "ubbbb"),
     "sort_count": KernelSpec("sort.cl", "uubb"),
@@ -42,7 +42,7 @@ KERNELS: dict[str, KernelSpec] = {
     "exclusive_scan": KernelSpec("sort.cl", "uub", "group"),
     # Most splats touch at most 8 block rows, so vectors of 16 would be slower.
     "tile_room": KernelSpec("tiles.cl", "uubbb", widest=8),
-    "tile_count": KernelSpec("tiles.cl", "uuffibbbbb", "block", widest=8),
+    "tile_count": KernelSpec("tiles.cl", "uuffbbbbb", "block", widest=8),
     "tile_scatter": KernelSpec("tiles.cl", "ubbbb", "block", widest=8),
     "blend": KernelSpec("blend_{form}.cl", _BLEND, "tile", stats=0),
     "blend_stats": KernelSpec("blend_{form}.cl", _BLEND + "bb", "tile", stats=1),

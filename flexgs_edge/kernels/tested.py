@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -12,8 +11,7 @@ from dataclasses import replace
 
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
 from flexgs_edge.kernels.verdict import CACHE_VARIABLE, Verdict, keep_verdict, kept_verdict, key_of
-
-LOG = logging.getLogger("flexgs_edge")
+from flexgs_edge.progress import LOG
 
 CHILD = [sys.executable, "-m", "flexgs_edge.kernels.self_test_child"]
 """The command that tests one device. A compiler that crashes ends that process, not ours."""

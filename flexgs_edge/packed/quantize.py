@@ -128,19 +128,6 @@ def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, gr
     return total
 
 
-def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray:
-    """Quantize an array that lies in memory.
-
-    `values`: [c, n] f32, finite, magnitudes up to `LARGEST`.
-
-    Raises `InputError` if a value is not finite or too large.
-    """
-    values = np.asarray(values, np.float32)
-    channels, rows = values.shape
-    layouts = {"values": (channels, bits)}
-    return _quantize_stream(lambda part, names: {"values": values}, layouts, rows, groups, rows)["values"]
-
-
 def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
     """[c, n] u16, the codes of `rows` (a slice with step 1)."""
     start, stop, _ = rows.indices(array.count)
@@ -175,22 +162,6 @@ def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndar
         value *= np.repeat(array.step[channel, groups], sizes)
         value += np.repeat(array.low[channel, groups], sizes)
     return out
-
-
-def largest_error(array: QuantizedArray) -> np.ndarray:
-    """Bound on the error |x' - x| of the quantizer, per channel and group.
-
-    It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code *
-    step and of the sum. Each rounding is at most 2^-24 of the largest number in it.
-
-    Returns [c, G] f64.
-    """
-    low, step = array.low.astype(np.float64), array.step.astype(np.float64)
-    span = step * (2**array.bits - 1)
-    # A step that underflowed to zero stands for a range of at most (2^bits - 1) * SMALLEST_STEP.
-    lost = np.where(step == 0, SMALLEST_STEP * (2**array.bits - 1), 0.0)
-    bound: np.ndarray = step / 2 + 2.0**-22 * span + 2.0**-24 * np.maximum(abs(low), abs(low + span)) + lost
-    return bound
 
 
 def quantize_scene(

@@ -21,15 +21,7 @@ PLAIN = 0.25 / 255.0
 def details(image: np.ndarray) -> np.ndarray | None:
     """What lies between the two scales of a picture, at unit norm; `None` for a picture that shows nothing.
 
-    Parameters
-    ----------
-    image : np.ndarray
-        [H, W, 3] f32, `SIDE` pixels on the longer side.
-
-    Returns
-    -------
-    np.ndarray or None
-        [H, W, 3] f32.
+    `image`: [H, W, 3] f32, `SIDE` pixels on the longer side. Returns [H, W, 3] f32.
     """
     smooth = _window_mean(_window_mean(np.clip(image, 0.0, 1.0).astype(np.float64), FINE), FINE)
     found = smooth - _window_mean(smooth, COARSE)

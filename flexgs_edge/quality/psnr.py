@@ -144,12 +144,8 @@ def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
     Pictures with much detail are farther from their photos than those with little, about as far as from themselves when they
     are moved by three quarters of a pixel: docs/results/tuning.md#default_base_psnr
 
-    Parameters
-    ----------
-    errors : sequence of float
-        `moved_error` of the original's render in each view.
-    coverages : sequence of float
-        Share of each view that the original covers, which alone counts.
+    `errors`: `moved_error` of the original's render in each view. `coverages`: share of each view that the original
+    covers, which alone counts.
 
     >>> lone_base([5e-4, 2.5e-4], [1.0, 0.5]), lone_base([0.0], [1.0])
     (33.0, 36.0)

@@ -98,26 +98,24 @@ class ShownView:
         return np.concatenate(self._rows) if self._rows else np.zeros(0, np.uint32)
 
 
-def fill_compact(
-    backend: Backend, scene: DeviceScene, buffers: ViewBuffers, views: Sequence[CompactView], inria_extent: int
-) -> int:
+def fill_compact(backend: Backend, scene: DeviceScene, buffers: ViewBuffers, views: Sequence[CompactView]) -> int:
     """Project the scene chunk by chunk, and give each view the splats that it shows, in row order.
 
     Returns the row of the scene that was reached. It stops early if a view has no more room.
     """
 
     def wanted(bounds: ChunkBounds) -> bool:
-        return any(bounds.seen(view.record, bool(inria_extent)).any() for view in views)
+        return any(bounds.seen(view.record).any() for view in views)
 
     out, blocks = buffers.chunk, buffers.blocks(-(-scene.compact_rows // ROW_BLOCK))
     # Kept for all chunks: fresh pages for each one take longer than the copies.
     on_host = [np.empty(shape, dtype) for shape, dtype in chunk_shapes(out[0].shape[0]).values()]
     for chunk in scene.chunks(wanted):
         for view in views:
-            seen = scene.blocks_seen(chunk, view.record, inria_extent)
+            seen = scene.blocks_seen(chunk, view.record)
             part = ViewPart.of(chunk, seen, 0, 0, blocks)
             backend.write(blocks, seen)
-            chunk.project(backend, view.camera, part, inria_extent, scene.antialiased, out)
+            chunk.project(backend, view.camera, part, scene.antialiased, out)
             records, keys, bounds = map(backend.read, out, (values[: part.count] for values in on_host))
             shown = np.flatnonzero(keys != CULLED)
             rows = part.rows.take(shown)
@@ -221,7 +219,7 @@ class ViewsAhead:
             self.drop()
 
     def fill(
-        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, storage: Storage, near: float, inria_extent: int
+        self, scene: DeviceScene, camera: Camera, buffers: ViewBuffers, storage: Storage, near: float
     ) -> tuple[int, int, np.ndarray | None]:
         """Put the splats that a view shows into its buffers.
 
@@ -231,7 +229,7 @@ class ViewsAhead:
         assert buffers.rows is not None
         record = camera_record(camera, scene.origin, near)
         self._backend.write(buffers.camera, record)
-        project = partial(fill_compact, self._backend, scene, buffers, inria_extent=inria_extent)
+        project = partial(fill_compact, self._backend, scene, buffers)
         in_turn = self._scene == (scene, scene.changes)
         waiting = next((view for view in self._waiting if view.of is camera), None) if in_turn else None
         if waiting is None:

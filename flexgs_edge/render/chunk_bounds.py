@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.constants import EXTENT_SLACK, LOG2_255, ROW_BLOCK, SIGMA_RADIUS_INRIA, TILE
+from flexgs_edge.constants import EXTENT_SLACK, LOG2_255, ROW_BLOCK
 
 SIGMAS = math.sqrt((LOG2_255 + EXTENT_SLACK) * 2.0 * math.log(2.0))
-"""Standard deviations that the exact ellipse of an opaque splat reaches."""
-INRIA_SPREAD = math.sqrt(math.sqrt(0.1))
-"""Upper bound of what the floor of 0.1 adds to the square root of the larger eigenvalue."""
+"""Standard deviations that the ellipse of an opaque splat reaches."""
 ROUNDING = 1e-5
 """Bound of the float32 error in `project`, as a share of the largest term: generous, so that no block vanishes by
 rounding."""
@@ -49,7 +47,7 @@ class ChunkBounds:
         with np.errstate(over="ignore", invalid="ignore"):
             return cls((low + high) / 2, (high - low) / 2, LARGER * np.exp(largest))
 
-    def seen(self, record: np.ndarray, inria_extent: bool) -> np.ndarray:
+    def seen(self, record: np.ndarray) -> np.ndarray:
         """[blocks] bool, whether a view may show a row of each block; `record` is its `camera_record` ([32] f32)."""
         camera = record.astype(np.float64)
         rotation, shift = camera[:9].reshape(3, 3), camera[9:12]
@@ -59,9 +57,6 @@ class ChunkBounds:
             # Reach: `spread` times the extent at depth 1, in scene units, and `pixels` at any.
             spread = [SIGMAS * abs(f) * slope for f, slope in zip((fx, fy), slopes, strict=True)]
             pixels = SIGMAS * math.sqrt(dilation)
-            if inria_extent:
-                spread = [SIGMA_RADIUS_INRIA / SIGMAS * (spread[0] + spread[1])] * 2
-                pixels = SIGMA_RADIUS_INRIA * (2 * math.sqrt(dilation) + INRIA_SPREAD) + 1 + TILE
             # The sides of the picture, near plane first: its axis, and the factors of x or y and of depth.
             axis = [0, 0, 0, 1, 1]
             across = np.array([0.0, fx, -fx, fy, -fy])

@@ -68,12 +68,10 @@ class Chunk:
         """Blocks of ROW_BLOCK rows."""
         return -(-self.count // ROW_BLOCK)
 
-    def project(
-        self, backend: Backend, camera: Any, part: ViewPart, inria_extent: int, antialiased: bool, out: tuple[Any, ...]
-    ) -> None:
+    def project(self, backend: Backend, camera: Any, part: ViewPart, antialiased: bool, out: tuple[Any, ...]) -> None:
         """Project the rows of a part to splat records, depth keys and bounds of tiles."""
         backend.launch(
-            "project", (padded(part.count),), part.count, self.stride, part.base, part.first, self.degree, inria_extent,
+            "project", (padded(part.count),), part.count, self.stride, part.base, part.first, self.degree,
             int(antialiased), part.blocks, camera, *self.arrays, *out,
         )  # fmt: skip
 

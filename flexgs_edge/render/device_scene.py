@@ -238,12 +238,12 @@ class DeviceScene:
             for start in range(first, last, self._rows):
                 yield start, min(start + self._rows, last), degree
 
-    def blocks_seen(self, chunk: Chunk, record: np.ndarray | None, inria_extent: int) -> np.ndarray:
+    def blocks_seen(self, chunk: Chunk, record: np.ndarray | None) -> np.ndarray:
         """[.] u32, the blocks of a chunk that a view may show, by its `camera_record`; all of them for None."""
         bounds = self._planes.bounds.get(chunk.base)
         if record is None or bounds is None:
             return np.arange(chunk.blocks, dtype=np.uint32)
-        return np.flatnonzero(bounds.seen(record, bool(inria_extent))).astype(np.uint32)
+        return np.flatnonzero(bounds.seen(record)).astype(np.uint32)
 
     @property
     def blocks(self) -> int:

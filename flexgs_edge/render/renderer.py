@@ -13,7 +13,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
@@ -28,8 +28,6 @@ from flexgs_edge.render.statistics import Statistics, SumReader
 from flexgs_edge.render.tile_lists import list_tiles, sort_splats, split_batches
 from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
-
-EXTENTS = ("exact", "inria")
 
 
 @dataclass
@@ -46,8 +44,7 @@ class _View:
 class Renderer:
     """Renders views and sums what each Gaussian contributes, on a backend.
 
-    `extent` ({"exact", "inria"}): pixels that a splat may reach: the ellipse of alpha >= 1/255 (default), or the tiles
-    of ceil(3 sigma) that the reference rasteriser uses. `antialiased`: multiply opacities by sqrt(det before / det
+    `antialiased`: multiply opacities by sqrt(det before / det
     after) of the 2D covariance's dilation. Set it if the model was trained so. `storage`: takes the sums over views if
     memory cannot hold them beside a view. `largest`: the largest view to come, if it is known. Its size decides whether
     views have room for all rows.
@@ -59,17 +56,13 @@ class Renderer:
         budget: MemoryBudget,
         near: float = DEFAULT_NEAR,  # near plane, scene units
         background: Sequence[float] = (0.0, 0.0, 0.0),  # red, green, blue in [0, 1]; black by default
-        extent: str = "exact",
         antialiased: bool = False,
         fit: Fit | None = None,  # how scenes and views share memory
     ) -> None:
-        if extent not in EXTENTS:
-            raise InputError(f"extent {extent!r}: expected one of {', '.join(EXTENTS)}")
         self.backend = backend
         self.budget = budget
         self.near = near
         self.background = tuple(float(np.float32(c)) for c in background)
-        self.inria_extent = int(extent == "inria")
         self.antialiased = antialiased
         self.fit = fit or fit_module.DEFAULT
         self.storage: Storage = IN_MEMORY
@@ -296,13 +289,13 @@ class Renderer:
         blocks, parts = buffers.blocks(scene.blocks), {}
         base = first = 0
         for chunk in scene.chunks():
-            seen = scene.blocks_seen(chunk, None if whole else record, self.inria_extent)
+            seen = scene.blocks_seen(chunk, None if whole else record)
             part = parts[chunk.base] = ViewPart.of(chunk, seen, base, first, blocks)
             base, first = base + part.count, first + len(seen)
             if part.count:
                 self.backend.write(blocks, seen, part.first)
                 chunk.project(
-                    self.backend, buffers.camera, part, self.inria_extent, scene.antialiased,
+                    self.backend, buffers.camera, part, scene.antialiased,
                     (buffers.records, buffers.keys, buffers.bounds),
                 )  # fmt: skip
         return parts
@@ -316,7 +309,7 @@ class Renderer:
         or from an estimate by the part of the scene that was projected.
         """
         while True:
-            count, seen, rows = self._ahead.fill(scene, camera, buffers, self.storage, self.near, self.inria_extent)
+            count, seen, rows = self._ahead.fill(scene, camera, buffers, self.storage, self.near)
             if rows is not None:
                 self._share = max(self._share, count / max(scene.count, 1))
                 return buffers, rows
@@ -336,7 +329,7 @@ class Renderer:
         backend, buffers, camera = self.backend, view.buffers, view.camera
         for index, (start, stop) in enumerate(view.batches):
             if not (again and len(view.batches) == 1):
-                list_tiles(backend, buffers, camera, start, stop - start, self.inria_extent)
+                list_tiles(backend, buffers, camera, start, stop - start)
             backend.launch(
                 blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
                 int(index > 0), int(finish and index == len(view.batches) - 1), *self.background,

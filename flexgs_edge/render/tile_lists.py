@@ -65,15 +65,13 @@ def _pieces(backend: Backend, buffers: ViewBuffers, start: int, count: int) -> I
             yield stop, pairs
 
 
-def list_tiles(
-    backend: Backend, buffers: ViewBuffers, camera: Camera, start: int, count: int, inria_extent: int
-) -> None:
+def list_tiles(backend: Backend, buffers: ViewBuffers, camera: Camera, start: int, count: int) -> None:
     """List the pairs of `count` splats, from place `start` of the depth order on, tile by tile."""
     blocks = backend.tile_blocks
     ids = buffers.sorted[0][1]
     backend.launch("tile_room", (blocks,), start, count, ids, buffers.bounds, buffers.pair_room)
     backend.launch(
-        "tile_count", (blocks,), start, count, camera.width, camera.height, inria_extent, ids, buffers.records,
+        "tile_count", (blocks,), start, count, camera.width, camera.height, ids, buffers.records,
         buffers.pair_room, buffers.drafts, buffers.ends,
     )  # fmt: skip
     backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flexgs_edge.report.run_info import record
+from flexgs_edge.report.summary import aligned
 from flexgs_edge.units import format_size
 
 
@@ -136,14 +137,8 @@ _GRID_COLUMNS = {
 
 def _channel_table(channels: Mapping[str, Mapping[str, Any]], version: int) -> list[str]:
     columns = _PACKED_COLUMNS if version == 1 else _GRID_COLUMNS
-    rows = [("attribute", *columns)]
-    for name, item in channels.items():
-        rows.append((name, *(_cell(item[word]) for word in columns.values())))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))])
-        for row in rows
-    ]
+    rows = [(name, *(_cell(item[word]) for word in columns.values())) for name, item in channels.items()]
+    return aligned([("attribute", *columns), *rows])
 
 
 def _cell(value: float | None) -> str:

@@ -360,8 +360,7 @@ def _compress_facts(result: CompressResult) -> list[tuple[str, object]]:
         steps = (f"{name} {value:.3g}" for name, value in result.steps.items() if isinstance(value, float))
         facts.append(("grid steps", ", ".join(steps)))
     elif result.bits:
-        found = " (found by sensitivity)" if result.sensitivity else ""
-        facts.append(("bits", ", ".join(f"{name} {bits}" for name, bits in result.bits.items()) + found))
+        facts.append(("bits", ", ".join(f"{name} {bits}" for name, bits in result.bits.items())))
     if result.target is not None:
         facts += [("target", result.target), ("decided by", decided_words(result))]
     return facts

@@ -8,16 +8,16 @@ and targets.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
-from flexgs_edge.packed.bitspec import Sensitivity
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import (
+    aligned,
     decibel,
     line,
     quality_lines,
@@ -59,7 +59,6 @@ class CompressResult:
     reached: bool | None  # whether the deciding views meet the target; `None` for fixed rates
     decision_views: str  # the kind of views that decided: `held-out`, `training` or `none`
     search: SearchResult | None  # every step of the search; `None` for fixed rates
-    sensitivity: tuple[Sensitivity, ...]  # loss per attribute and bit width, as `--bits auto` measured it
     quality: Quality | None  # quality of the decoded file over `quality_views`; `None` without cameras
     quality_views: str  # the kind of views that `quality` is measured on: `held-out`, `training` or `none`
     score_cache: str | None  # file that keeps the scores between runs
@@ -100,7 +99,6 @@ class CompressResult:
             ratio_of_input=rounded(self.ratio_of_input),
             promise=promise_json(self.promise),
             search=[step_json(step) for step in self.search.steps] if self.search else [],
-            sensitivity=[{**asdict(item), "loss": item.loss} for item in self.sensitivity],
             quality=quality_json(self.quality) if self.quality else None,
             training_fidelity=rounded(self.training_fidelity),
         )
@@ -128,7 +126,7 @@ class CompressResult:
             lines.append(line("grid steps", ", ".join(steps)))
         else:
             bits = " ".join(f"{name}={bits}" for name, bits in self.bits.items())
-            lines.append(line("bits", bits + (" (found by sensitivity)" if self.sensitivity else "")))
+            lines.append(line("bits", bits))
         lines += _decision_lines(self)
         if self.quality is not None:
             decoded = "decoded file" if self.output else "as it would decode"
@@ -223,11 +221,4 @@ def _view_table(views: Sequence[ViewQuality]) -> list[str]:
     if any(view.lpips_original is not None for view in views):
         columns += [figure("LPIPS to ref.", "lpips_original"), figure("LPIPS", "lpips_photo")]
         columns.append(figure("of original", "original_lpips"))
-    rows = [[head for head, _ in columns], *([cell(view) for _, cell in columns] for view in views)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in rows
-    ]
+    return aligned([[head for head, _ in columns], *([cell(view) for _, cell in columns] for view in views)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from flexgs_edge.report.run_info import SIMILARITIES, RunInfo, SceneInfo, ViewsInfo
@@ -166,3 +167,12 @@ def line(label: str, words: str) -> str:
 def text(lines: list[str]) -> str:
     """Join lines to a text."""
     return "\n".join(lines) + "\n"
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table: names to the left, all other cells to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))])
+        for row in rows
+    ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -13,11 +12,11 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.io.formats import WRITTEN
 from flexgs_edge.io.gzipped import GZ
 from flexgs_edge.io.model_folder import POINT_CLOUD
+from flexgs_edge.progress import LOG
 from flexgs_edge.run.open_scene import SUFFIXES, scene_file
 
 StrPath = str | os.PathLike[str]
 
-LOG = logging.getLogger("flexgs_edge")
 
 FGS = ".fgs"
 COMPANIONS = (

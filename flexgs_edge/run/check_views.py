@@ -6,7 +6,6 @@ photos, and with those of their neighbours. Without photos the renders must show
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.conventions import other_conventions
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RDF, Frame
+from flexgs_edge.progress import LOG
 from flexgs_edge.quality.likeness import SIDE, details, likeness
 from flexgs_edge.quality.psnr import mse, psnr
 from flexgs_edge.render.device_scene import DeviceScene
@@ -28,8 +28,6 @@ from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.views.render_context import RenderContext
-
-LOG = logging.getLogger("flexgs_edge")
 
 RUNS, RUN = 5, 3
 """Views are compared in at most so many runs, evenly spread, of so many neighbours in order of name."""
@@ -66,24 +64,9 @@ class _Compared:
 def check_views(run: Run[Options], context: RenderContext, trusted: bool) -> Run[Options]:
     """Compare some views with their photos (stage `check views`).
 
-    Parameters
-    ----------
-    run : Run
-        With views.
-    context : RenderContext
-        Draws; nothing is loaded afterwards.
-    trusted : bool
-        Warn of views that do not belong to the scene, and go on.
-
-    Returns
-    -------
-    Run
-        With the words among its warnings.
-
-    Raises
-    ------
-    InputError
-        When most views do not show the scene; the message names the likely cause.
+    `run`: with views. `context`: draws; nothing is loaded afterwards. `trusted`: warn of views that do not belong
+    to the scene, and go on. Returns the run with the words among its warnings. Raises `InputError` when most views do not
+    show the scene; the message names the likely cause.
     """
     views = run.seen
     if views.cameras_from == AUTO_CAMERAS:

@@ -21,17 +21,14 @@ def fingerprint(
     cameras: Sequence[Camera],  # The training views, at the size they are drawn. Their names do not change the digest.
     kind: str,  # the score, such as `gs`
     near: float,
-    extent: str,
     antialiased: bool = False,
     fields: Sequence[str] = FIELDS,  # fields of the scene to hash
 ) -> str:
     """Hash everything that scores depend on. Reads the scene once, by default without its colours.
 
-    `near`, `extent`, `antialiased`: how views are drawn. Returns the digest in hexadecimal.
+    `near`, `antialiased`: how views are drawn. Returns the digest in hexadecimal.
     """
-    digest = hashlib.sha256(
-        f"{__version__} {kind} {near!r} {extent} {antialiased} {source.count} {len(cameras)}".encode()
-    )
+    digest = hashlib.sha256(f"{__version__} {kind} {near!r} exact {antialiased} {source.count} {len(cameras)}".encode())
     digest.update(source.origin.astype("<f8").tobytes())
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

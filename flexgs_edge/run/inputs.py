@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions, find_companions
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.progress import LOG as LOG
 from flexgs_edge.report.run_info import SceneInfo
 from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
@@ -23,8 +23,6 @@ from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 def companions_of(path: str | os.PathLike[str]) -> Companions:
@@ -145,8 +143,7 @@ def resolve_drawing(options: Options, scene: CheckedScene, companions: Companion
         antialiased = found if isinstance(found, bool) else False
         if antialiased:
             LOG.info("drawing antialiased, as %s says", "the file" if "antialiased" in stored else "cfg_args")
-    extent = options.extent or stored.get("extent") or "exact"
-    return replace(options, near=near, background=background, extent=extent, antialiased=antialiased)
+    return replace(options, near=near, background=background, antialiased=antialiased)
 
 
 def _background(value: object, default: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from flexgs_edge.goals.steps import Choice, SearchResult
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.packed.bitspec import BitSpec, Sensitivity
+from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.quality.view_quality import Quality
 
 
@@ -29,6 +29,5 @@ class MethodResult:
     bits: BitSpec | None = None  # bits per attribute (`paper`)
     groups: Mapping[str, int] | None = None  # quantization groups per array (`paper`)
     step_sizes: StepSizes | None = None  # quantization step sizes (`best`)
-    sensitivity: tuple[Sensitivity, ...] = ()  # loss per attribute and bit width, as `--bits auto` measured it
     scores_reused: bool = False  # whether the scores came from the cache
     preview_bytes: int = 0  # bytes of the file that are its preview (`best`); 0 if it has none

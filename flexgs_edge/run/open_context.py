@@ -24,14 +24,14 @@ def open_context(
 
     With `needed`, errors about the memory limit name one that is enough for the whole run: see `foresee`.
 
-    `run`: names the device, and pays for memory. `cluster`: address of a Dask scheduler, or `local:N`. Each worker gets
+    `run`: names the device, and pays for memory. `cluster`: address of a Dask scheduler. Each worker gets
     the run's whole memory limit. Default: no cluster. Opening it is timed as the stages `device` and `cluster`.
     Raises `DeviceError` if the named device does not exist or failed its self-test.
     """
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None
-    assert options.extent is not None and options.antialiased is not None
-    drawing = options.near, run.background or options.background, options.extent, options.antialiased
+    assert options.antialiased is not None
+    drawing = options.near, run.background or options.background, options.antialiased
     if needed is not None:
         with run.clock.stage("open"):
             foresee(run, False, needed, compares)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Callable, Iterable
@@ -31,8 +30,6 @@ from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Targ
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
-
-LOG = logging.getLogger("flexgs_edge")
 
 NO_PHOTOS = "none"  # `--images none`: do not use the photos beside the scene
 AUTO_CAMERAS = "auto"  # `--cameras auto`: generate camera views from the scene itself
@@ -122,7 +119,6 @@ class ViewOptions:
     resolution: int = MAX_VIEW_WIDTH
     near: float | None = None
     background: tuple[float, float, float] | None = None
-    extent: str | None = None
     antialiased: bool | None = None
     up: tuple[float, float, float] | None = None
     drop_invalid: bool = False
@@ -335,11 +331,9 @@ class CompressOptions(ViewOptions):
             parts.append(MadePoses())
         return parts
 
-    def bit_spec(self) -> tuple[BitSpec | None, int | None]:
-        """Bits and groups that `--bits` and `--groups` ask for. `None` for bits: measure them (`auto`)."""
+    def bit_spec(self) -> tuple[BitSpec, int | None]:
+        """Bits and groups that `--bits` and `--groups` ask for."""
         words = self.bits.strip().lower()
-        if words == "auto":
-            return None, self.groups
         if words == "paper":
             return PAPER, self.groups
         if words.startswith("rtn"):

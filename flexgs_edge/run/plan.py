@@ -31,19 +31,14 @@ class Plan:
     def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
-        bits, _ = options.bit_spec()
         if views is None:
             if options.method != "paper":
                 raise InputError(
                     f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
                     "--method paper with both rates 0 works"
                 )
-            if fixed is None or needs_scores or bits is None:
-                why = (
-                    "to score Gaussians and to judge the result"
-                    if fixed is None or bits is None
-                    else "to score Gaussians"
-                )
+            if fixed is None or needs_scores:
+                why = "to score Gaussians and to judge the result" if fixed is None else "to score Gaussians"
                 raise InputError(
                     f"{WITHOUT_VIEWS}. Views are needed {why}; without them only --prune-rate 0 and --sh-rate 0 work"
                 )
@@ -52,7 +47,7 @@ class Plan:
             raise InputError(
                 "--holdout 0 leaves no view to decide on: use --select train as well, or another --holdout"
             )
-        if not views.train and (options.method != "paper" or needs_scores or bits is None or options.select == "train"):
+        if not views.train and (options.method != "paper" or needs_scores or options.select == "train"):
             raise InputError(
                 f"{views.cameras_from}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
                 "give more views, or --holdout 0 --select train"

@@ -200,7 +200,7 @@ class QualityEvaluator:
 
         `lpips`: also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.context.ready_cluster is not None
+        whole, elsewhere = self.reports and with_ssim and lpips is None, self.context.cluster is not None
         drawn = scene.fingerprint(elsewhere) if whole else None
         known = self._known.get(drawn) if drawn is not None else None
         if known is not None and (known.worst_flip or not flip):

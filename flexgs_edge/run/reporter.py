@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import logging
 import os
 import tempfile
 from collections.abc import Callable, Sequence
@@ -18,7 +17,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.goals.target import Target
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
@@ -32,9 +31,6 @@ from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.source import SceneSource
-
-LOG = logging.getLogger("flexgs_edge")
-
 
 MOST_SHOTS = 5
 """A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""

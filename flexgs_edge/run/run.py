@@ -13,11 +13,10 @@ from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import MovedSource, check_positions
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.run.background import Colour, contrasting_background
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.inputs import (
-    LOG,
     CheckedScene,
     Options,
     ScenePlace,
@@ -40,7 +39,7 @@ from flexgs_edge.scene.source import SceneSource
 class Run(Generic[Options]):
     """What was asked, and of what. Nothing in it changes."""
 
-    options: Options  # with near plane, background, extent and antialiasing filled in
+    options: Options  # with near plane, background and antialiasing filled in
     scene: CheckedScene  # checked
     views: ViewSet | None  # `None` for `--cameras none`
     plan: Plan | None  # what a run of `compress` needs; `None` for other commands
@@ -70,11 +69,6 @@ class Run(Generic[Options]):
         """What a search aims at."""
         assert self.plan is not None and self.plan.target is not None
         return self.plan.target
-
-    def aimed_at(self, target: Target) -> Run[Options]:
-        """The same run with another target."""
-        assert self.plan is not None
-        return replace(self, plan=replace(self.plan, target=target))
 
     def of_source(self, source: SceneSource) -> Run[Options]:
         """The same run on other values."""

@@ -35,7 +35,7 @@ def make_settings(
         "score": options.score if plan.needs_scores else None,
         "prune_rate": choice.prune / 1000,
         "sh_rate": choice.sh / 1000,
-        "bits": None if bits is None else options.bits if options.bits in ("auto", "paper") else str(bits),
+        "bits": None if bits is None else options.bits if options.bits == "paper" else str(bits),
         "source_count": scene.input_count,
         "source_sh_degree": scene.source.sh_degree,
         "target": plan.target.describe() if plan.target else None,
@@ -52,7 +52,7 @@ def make_settings(
         },
         "near": options.near,
         "background": list(options.background),
-        "extent": options.extent,
+        "extent": "exact",
         "antialiased": options.antialiased,
     }
 

@@ -18,10 +18,11 @@ from flexgs_edge.cameras.scene_sample import READ_ROWS
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.progress import LOG
 from flexgs_edge.report.run_info import ViewsInfo
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.counted_backend import counted_backend
-from flexgs_edge.run.inputs import LOG, Options
+from flexgs_edge.run.inputs import Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.views.sketch import sketch

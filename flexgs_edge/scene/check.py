@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 import numpy as np
 
 from flexgs_edge.constants import ALPHA_MIN
 from flexgs_edge.errors import InputError
+from flexgs_edge.progress import LOG
 from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource, WrappedSource
 
-LOG = logging.getLogger("flexgs_edge")
 TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15

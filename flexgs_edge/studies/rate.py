@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.formats import FORMATS
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.report.as_json import rounded
 from flexgs_edge.report.plots import LineChart, Series
@@ -26,8 +25,6 @@ from flexgs_edge.run.options import NO_CAMERAS, CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Row, Table, columns, figures, number
 from flexgs_edge.studies.written import SceneStudy, Study, write_study
-
-LOG = logging.getLogger("flexgs_edge")
 
 RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PEERS = (".spz", ".sog", ".compressed.ply")  # Formats of other programs that the study compares with

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from flexgs_edge.commands.compress import compress
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns, figures, number
 from flexgs_edge.studies.written import SceneStudy, Study, write_study
-
-LOG = logging.getLogger("flexgs_edge")
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.goals.promise import WORST_MORE, WORST_TIMES
 from flexgs_edge.goals.target import Figure
-from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.as_json import rounded
@@ -32,8 +31,6 @@ from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Row, Table, columns, figures, number
 from flexgs_edge.studies.written import SceneStudy, Study, write_study
 from flexgs_edge.views.depths import visible_depths
-
-LOG = logging.getLogger("flexgs_edge")
 
 BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"

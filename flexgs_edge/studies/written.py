@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import tempfile
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flexgs_edge.files import atomic_folder, check_folder
+from flexgs_edge.progress import LOG
 from flexgs_edge.report.as_json import json_text
 from flexgs_edge.report.html import render
 from flexgs_edge.report.plots import picture, require_matplotlib
@@ -18,8 +18,6 @@ from flexgs_edge.report.results import CompressResult, decided_words
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, fields_json, record
 from flexgs_edge.report.summary import device_words
 from flexgs_edge.studies.result_tables import Experiment
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 @dataclass(frozen=True)

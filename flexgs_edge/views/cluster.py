@@ -6,14 +6,11 @@ Dask schedules the views. If a worker is lost, another one draws its views again
 
 from __future__ import annotations
 
-import logging
-import os
-import threading
 import uuid
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
@@ -23,109 +20,49 @@ import numpy as np
 from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import DeviceError, InputError
+from flexgs_edge.progress import LOG
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
 from flexgs_edge.views.one_view import Drawn
-from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, warm_up, worker_version
-
-LOG = logging.getLogger("flexgs_edge")
+from flexgs_edge.views.worker import Drawing, draw_planes, draw_sums, worker_version
 
 AHEAD = 2  # Views asked for ahead, for each worker; their sums wait in the memory of the workers
 SENDINGS = 3  # How many times a scene is sent before we give up, if all workers that held it were lost
 CONNECT_SECONDS = 30
-NICE = 10
-"""Niceness of the worker processes that we start on this machine, so that the main process keeps a core:
-docs/results/tuning.md#nice"""
 
 
 class Cluster:
     """Workers that draw views; a context manager.
 
-    Worker processes on this machine take seconds to start. Until then, the caller draws the views itself.
-
-    `address`: address of a Dask scheduler, such as `tcp://10.0.0.5:8786`, or `local:N` for N single-threaded processes
-    on this machine. `drawing`: how workers draw. Raises `InputError` if the package is missing, the address is wrong,
-    nobody answers, or workers run another version of this program.
+    `address`: address of a Dask scheduler, such as `tcp://10.0.0.5:8786`. `drawing`: how workers draw. Raises
+    `InputError` if the package is missing, nobody answers, or workers run another version of this program.
     """
-
-    _starting: Future[None] | None = None
 
     def __init__(self, address: str, drawing: Drawing) -> None:
         if find_spec("distributed") is None:
             raise InputError("--cluster needs the package distributed: pip install 'flexgs-edge[cluster]'")
-        self._drawing = drawing
-        self._client: Any = None
-        self._local: Any = None
-        if not address.startswith("local:"):
-            self._connect(address, None)
-            return
-        count = address.removeprefix("local:")
-        if not count.isdecimal() or int(count) < 1:
-            raise InputError(f"--cluster {address}: expected a number of processes above 0, such as local:2")
-        starter = ThreadPoolExecutor(1, "cluster")
-        self._starting = starter.submit(self._connect, address, int(count))
-        starter.shutdown(wait=False)
-
-    def _connect(self, address: str, processes: int | None) -> None:
-        """Connect to the cluster, or start one with so many processes on this machine."""
-        if processes is not None and hasattr(os, "setpriority"):
-            # Niceness of this thread is inherited by the processes it starts; the main process keeps its own.
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         import distributed as dask  # slow to import
 
         distributed: Any = dask  # it has no types
-
-        self._lost = distributed.KilledWorker
-        if processes is not None:
-            self._local = distributed.LocalCluster(
-                n_workers=processes,
-                threads_per_worker=1,
-                memory_limit=0,  # the renderer of each worker has a limit of its own
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-                env={"POCL_MAX_PTHREAD_COUNT": "1"},
-            )
+        self._drawing, self._lost = drawing, distributed.KilledWorker
         try:
-            client = distributed.Client(
-                self._local or address,
-                timeout=CONNECT_SECONDS,
-                set_as_default=False,
-                direct_to_workers=self._local is not None,
-            )
+            client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
             versions = set(client.run(worker_version).values())
         except (OSError, ValueError, ImportError) as error:
             raise InputError(
                 f"--cluster {address}: no cluster of workers with flexgs-edge answers ({error})"
             ) from error
-        self._client = client
+        self._client: Any = client
         if versions != {__version__}:
-            self._leave()
+            self.close()
             raise InputError(
                 f"--cluster {address}: expected workers with flexgs-edge {__version__}, found "
                 f"{', '.join(sorted(versions)) or 'no worker'}"
             )
-        if processes is not None:
-            client.run(warm_up, self._drawing)
-
-    @property
-    def ready(self) -> bool:
-        """Whether there are workers; raises `InputError` if they could not be started."""
-        if self._starting is not None:
-            if not self._starting.done():
-                return False
-            self._starting.result()
-        return True
 
     def close(self) -> None:
-        """Leave the cluster; a local one ends."""
-        if self._starting is not None:
-            self._starting.exception()  # waits only: `ready` reports an error, and at the end it does not matter any more
-        self._leave()
-
-    def _leave(self) -> None:
-        for part in (self._client, self._local):
-            if part is not None:
-                part.close()
+        """Leave the cluster."""
+        self._client.close()
 
     def __enter__(self) -> Cluster:
         return self

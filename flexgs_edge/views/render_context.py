@@ -18,17 +18,11 @@ class RenderContext:
     """Draws the views of a run; a context manager that closes the cluster and the backend."""
 
     renderer: Renderer  # owns the backend and the budget
-    # Draws the views of `ViewSums.draw` and `images` in the renderer's stead, once it has workers.
-    cluster: Cluster | None = None
-
-    @property
-    def ready_cluster(self) -> Cluster | None:
-        """The cluster if its workers are there, else None."""
-        return self.cluster if self.cluster is not None and self.cluster.ready else None
+    cluster: Cluster | None = None  # draws the views of `ViewSums.draw` and `images` in the renderer's stead
 
     def images(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
         """Draw each view as `Renderer.render` does, in their order, here or on the cluster."""
-        renderer, cluster = self.renderer, self.ready_cluster
+        renderer, cluster = self.renderer, self.cluster
         if cluster is None or scene.source is None:
             for camera in renderer.in_turn(scene, cameras):
                 yield renderer.render(scene, camera)

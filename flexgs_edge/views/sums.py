@@ -170,7 +170,7 @@ class ViewSums:
         `references`: gives the target of a view by its place among `cameras`, if that method takes one. Yields gives
         the view's picture for `References.add`; valid until the next step.
         """
-        renderer, scene, cluster = self._renderer, self._scene, self._context.ready_cluster
+        renderer, scene, cluster = self._renderer, self._scene, self._context.cluster
         if cluster is None or scene.source is None:
             for view, camera in enumerate(renderer.in_turn(scene, cameras)):
                 self.add_view(view_sums(renderer, scene, kind, camera, references and references(view)), camera)

@@ -9,12 +9,10 @@ import numpy as np
 
 from flexgs_edge._version import __version__
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import TILE
 from flexgs_edge.kernels.open_backend import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.one_view import Drawn, drawn_sums
 
@@ -27,7 +25,6 @@ class Drawing:
     memory_limit: int | None
     near: float
     background: tuple[float, float, float]
-    extent: str
     antialiased: bool
 
 
@@ -47,9 +44,7 @@ class _Desk:
             self._key, self._scene = "", None
             budget = MemoryBudget.from_limit(drawing.memory_limit)
             backend = open_backend(drawing.device, budget)
-            self._renderer = Renderer(
-                backend, budget, drawing.near, drawing.background, drawing.extent, drawing.antialiased
-            )
+            self._renderer = Renderer(backend, budget, drawing.near, drawing.background, drawing.antialiased)
             self._drawing = drawing
         key, source = held
         if key != self._key or self._scene is None:
@@ -81,17 +76,6 @@ def draw_sums(
     with _DESK.lock:
         renderer, scene = _DESK.ready(held, drawing)
         return drawn_sums(renderer, scene, kind, camera, target, picture)
-
-
-def warm_up(drawing: Drawing) -> None:
-    """Draw one Gaussian, so that a worker loads its kernels before the first view."""
-    planes = {name: np.zeros((field.width(0), 1), np.float32) for name, field in FIELD.items()}
-    planes["quats"][0] = 1
-    camera = Camera("", TILE, TILE, np.eye(3), np.array([0.0, 0.0, 1.0]), TILE, TILE, TILE / 2, TILE / 2)
-    target = np.zeros((3, TILE, TILE), np.float16)
-    held = "", MemorySource(planes)
-    draw_sums(held, drawing, "removal_sums", camera, None, picture=True)
-    draw_sums(held, drawing, "residual_and_removal_sums", camera, target, picture=False)
 
 
 def worker_version() -> str:

@@ -131,7 +131,7 @@ def test_the_look_stays(sample_dir: Path, times: int, least: float) -> None:
     cameras = read_cameras(sample_dir / "cameras.json")[::10]
     budget = MemoryBudget.from_limit(2**31)
     backend = open_backend(None, budget)
-    renderer = Renderer(backend, budget, 0.2, (0.0, 0.0, 0.0), "exact", False)
+    renderer = Renderer(backend, budget, 0.2, (0.0, 0.0, 0.0), False)
     images = []
     for source in (parent, PartsSource(parent, times * parent.count, ONE)):
         with renderer.load(source) as loaded:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.camera_files import inria_json
 from flexgs_edge.api.scene import Scene
-from flexgs_edge.cameras.read import inria_json, read_cameras
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.cli import app
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RUB, FrameSource

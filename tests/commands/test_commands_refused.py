@@ -43,8 +43,6 @@ def test_no_cameras_at_all(tmp_path: Path, done: tuple[Path, CompressResult], pr
         compress(lonely, tmp_path / "a.fgs", **none)
     with pytest.raises(InputError, match="no views"):
         compress(lonely, tmp_path / "a.fgs", prune_rate=0.2, sh_rate=0.2, **none)
-    with pytest.raises(InputError, match="no views"):
-        compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, bits="auto", **none)
     with pytest.raises(InputError, match="photos need the cameras"):
         compress(lonely, tmp_path / "a.fgs", images=str(project / "images"), **FAST)
     whole = compress(lonely, tmp_path / "a.fgs", prune_rate=0, sh_rate=0, method="paper", cameras="none")

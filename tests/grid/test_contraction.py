@@ -11,10 +11,10 @@ import pytest
 
 import educational_decoder
 import educational_decoder2
+from benchmarks.quantize import dequantized
 from flexgs_edge.codec.header import HeaderError, checked_contraction
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.codec.v1.container import write_container
-from flexgs_edge.codec.v1.packed_source import QuantizedSource
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.grid_scene import GridScene
@@ -152,7 +152,7 @@ def test_contracted_codes_are_drawn_as_their_values(tmp_path: Path) -> None:
     renderer, camera = Renderer(open_form("w16"), large_budget()), make_camera(48, 32)
     with renderer.load_quantized(quantized) as scene:
         drawn = renderer.render(scene, camera)
-    with renderer.load(QuantizedSource(quantized)) as scene:
+    with renderer.load(dequantized(quantized)) as scene:
         np.testing.assert_array_equal(drawn, renderer.render(scene, camera))
 
 

@@ -60,11 +60,10 @@ def draw(
     camera: Camera,
     near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    extent: str = "exact",
     antialiased: bool = False,
 ) -> np.ndarray:
     """One image ([H, W, 3] f32) of a scene that is loaded and freed for it."""
-    renderer = Renderer(backend, large_budget(), near, background, extent, antialiased)
+    renderer = Renderer(backend, large_budget(), near, background, antialiased)
     with renderer.load(source) as scene:
         image = renderer.render(scene, camera)
     renderer.release()
@@ -72,15 +71,10 @@ def draw(
 
 
 def count(
-    backend: Backend,
-    source: SceneSource,
-    cameras: list[Camera],
-    near: float = 0.2,
-    extent: str = "exact",
-    antialiased: bool = False,
+    backend: Backend, source: SceneSource, cameras: list[Camera], near: float = 0.2, antialiased: bool = False
 ) -> Statistics:
     """Statistics of a scene over views."""
-    renderer = Renderer(backend, large_budget(), near, extent=extent, antialiased=antialiased)
+    renderer = Renderer(backend, large_budget(), near, antialiased=antialiased)
     statistics = Statistics.zeros(source.count)
     with renderer.load(source) as scene:
         for camera in cameras:

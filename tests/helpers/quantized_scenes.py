@@ -6,7 +6,7 @@ import numpy as np
 
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
-from flexgs_edge.packed.quantize import QuantizedScene, quantize_scene
+from flexgs_edge.packed.quantize import SMALLEST_STEP, QuantizedArray, QuantizedScene, _quantize_stream, quantize_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource
 
@@ -38,3 +38,32 @@ def assert_same_codes(one: QuantizedScene, two: QuantizedScene) -> None:
             x, y = getattr(a, part), getattr(b, part)
             assert x.dtype == y.dtype and x.shape == y.shape, (field.name, part)
             assert x.tobytes() == y.tobytes(), (field.name, part)
+
+
+def quantize_array(values: np.ndarray, bits: int, groups: int) -> QuantizedArray:
+    """Quantize an array that lies in memory.
+
+    `values`: [c, n] f32, finite, magnitudes up to `LARGEST`.
+
+    Raises `InputError` if a value is not finite or too large.
+    """
+    values = np.asarray(values, np.float32)
+    channels, rows = values.shape
+    layouts = {"values": (channels, bits)}
+    return _quantize_stream(lambda part, names: {"values": values}, layouts, rows, groups, rows)["values"]
+
+
+def largest_error(array: QuantizedArray) -> np.ndarray:
+    """Bound on the error |x' - x| of the quantizer, per channel and group.
+
+    It is half a step, plus the float32 roundings of the step (times the largest code), of (x - lo) / step, of code *
+    step and of the sum. Each rounding is at most 2^-24 of the largest number in it.
+
+    Returns [c, G] f64.
+    """
+    low, step = array.low.astype(np.float64), array.step.astype(np.float64)
+    span = step * (2**array.bits - 1)
+    # A step that underflowed to zero stands for a range of at most (2^bits - 1) * SMALLEST_STEP.
+    lost = np.where(step == 0, SMALLEST_STEP * (2**array.bits - 1), 0.0)
+    bound: np.ndarray = step / 2 + 2.0**-22 * span + 2.0**-24 * np.maximum(abs(low), abs(low + span)) + lost
+    return bound

@@ -208,18 +208,6 @@ def _colours(
     return np.maximum(colour, 0).T, error + 4 * EPS * (1 + abs(arrays["sh_dc"]).max(axis=0))
 
 
-def _inria_mask(splats: _Splats, k: int, width: int, height: int) -> np.ndarray:
-    """[H, W] bool: tiles of 16 that ceil(3 sigma), rounded out, reaches."""
-    a, b, c = splats.cov[k, 0, 0], splats.cov[k, 0, 1], splats.cov[k, 1, 1]
-    middle = (a + c) / 2
-    radius = math.ceil(3 * math.sqrt(middle + math.sqrt(max(0.1, middle * middle - (a * c - b * b)))))
-    mask = []
-    for centre, pixels in zip(splats.mean[k], (width, height)):
-        tile = np.arange(pixels) // 16
-        mask.append((tile >= math.floor((centre - radius) / 16)) & (tile < math.floor((centre + radius + 15) / 16)))
-    return mask[1][:, None] & mask[0]
-
-
 def alphas(splats: _Splats, k: int, xs: np.ndarray, ys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[H, W] alpha of a splat, the bound on its error, and where it is held at its cap."""
     dx, dy = xs - splats.mean[k, 0], ys - splats.mean[k, 1]
@@ -241,7 +229,6 @@ def render(
     camera: Camera,
     near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    extent: str = "exact",
     stop: float = STOP,
     antialiased: bool = False,
 ) -> Reference:
@@ -254,7 +241,7 @@ def render(
     xs, ys = np.arange(width)[None, :], np.arange(height)[:, None]
     image, trans = np.zeros((height, width, 3)), np.ones((height, width))
     bound, trans_error = np.zeros((height, width)), np.zeros((height, width))
-    everywhere, alive = np.ones((2, height, width), bool)
+    alive = np.ones((height, width), bool)
     fragile = np.zeros((height, width), bool)
     hits, unsure = np.zeros((2, count), np.int64)
     weights, weight_bound, weights2, removal = np.zeros((4, count))
@@ -267,16 +254,14 @@ def render(
             break
         alpha, alpha_error, _ = alphas(splats, k, xs, ys)
 
-        reached = everywhere if extent == "exact" else _inria_mask(splats, k, width, height)
-        candidate = alive & reached
-        seen = candidate & (alpha >= ALPHA_MIN)
+        seen = alive & (alpha >= ALPHA_MIN)
         after = trans * (1 - alpha)
         after_error = trans_error * (1 - alpha) + trans * alpha_error + 2 * EPS * after
         near_stop = seen & (abs(after - stop) <= after_error)
-        fragile |= candidate & (abs(alpha - ALPHA_MIN) <= alpha_error) | near_stop
+        fragile |= alive & (abs(alpha - ALPHA_MIN) <= alpha_error) | near_stop
         hit = seen & (after >= stop)
         # A pixel whose end is on the edge may go on in float32 where it stops here.
-        possible = fragile & reached & (alpha + alpha_error >= ALPHA_MIN)
+        possible = fragile & (alpha + alpha_error >= ALPHA_MIN)
         weight = np.where(hit, alpha * trans, 0.0)
         weight_error = np.where(hit, alpha * trans_error + trans * alpha_error + EPS * weight, 0.0)
         if hit.any():

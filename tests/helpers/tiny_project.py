@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flexgs_edge.cameras.read import inria_json, read_cameras
+from benchmarks.camera_files import inria_json
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.open_backend import open_backend

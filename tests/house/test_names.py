@@ -16,13 +16,8 @@ DEFINING = ("kernels/twins/__init__.py",)
 FACE = "__init__.py"
 """The package's own face may have what loads its names when they are first used."""
 LAZY = {"_HOMES", "__getattr__", "__dir__", "__all__"}
-# Places that answer one question: a command or a study and its options, two versions of the file, every method.
-ALIKE = (
-    {"commands", "cli"},
-    {"codec/v1", "codec/v2"},
-    {"methods/best", "methods/foreign", "methods/paper"},
-    {"studies", "cli/study"},
-)
+# Places that answer one question: a command and its options, two versions of the file, every method.
+ALIKE = ({"commands", "cli"}, {"codec/v1", "codec/v2"}, {"methods/best", "methods/foreign", "methods/paper"})
 SHARED = {"header": "codec"}
 """Names that a further folder may have: what the headers of both versions share."""
 REGISTERING = {"register", "add_command", "command", "group"}
@@ -182,7 +177,6 @@ def plant(package: Path, module: str, statement: str) -> None:
         ("io/__init__.py", "def read() -> None: ..."),
         ("views/__init__.py", "if True:\n    import os"),
         ("__init__.py", "def helper() -> None: ..."),
-        ("cli/study/__init__.py", "command.name = 'other'"),
     ],
 )
 def test_a_package_that_defines_is_seen(planted: Path, module: str, statement: str) -> None:

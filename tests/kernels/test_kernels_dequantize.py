@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from flexgs_edge.constants import DEQUANTIZE_ROWS
-from flexgs_edge.packed.quantize import QuantizedArray, dequantize, group_count, quantize_array
+from flexgs_edge.packed.quantize import QuantizedArray, dequantize, group_count
 from kernel_fixtures import ALL_FORMS, launch, open_form, same_bits
+from quantized_scenes import quantize_array
 
 COUNTS = (1, 7, 63, 64, 65, 129, 1000, 2049)
 

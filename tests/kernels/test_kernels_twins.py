@@ -47,16 +47,15 @@ def test_every_kernel_has_a_twin() -> None:
     assert set(TWINS) == set(KERNELS)
 
 
-@pytest.mark.parametrize("extent", ["exact", "inria"])
 @pytest.mark.parametrize("rows", COUNTS)
 @pytest.mark.parametrize("form", FORMS)
-def test_whole_views(form: str, rows: int, extent: str) -> None:
+def test_whole_views(form: str, rows: int) -> None:
     paired = PairedBackend(open_form(form), 3)
     rotation, translation = look_from(rows)
     camera = make_camera(45, 37, rotation=rotation, translation=translation)
     scene = random_scene(rows, 1, rows % 5, size=-3 if rows > 100 else -2)
-    image = draw(paired, scene, camera, background=(0.1, 0.5, 1.0), extent=extent)
-    statistics = count(paired, scene, [camera, make_camera(45, 37)], extent=extent)
+    image = draw(paired, scene, camera, background=(0.1, 0.5, 1.0))
+    statistics = count(paired, scene, [camera, make_camera(45, 37)])
     assert np.isfinite(image).all()
     assert statistics.hits.any() == (rows > 0)
     assert paired.launched["blend"] == 1 and paired.launched["blend_stats"] == 2
@@ -129,12 +128,11 @@ def strange_scene() -> MemorySource:
     return MemorySource(arrays, 2)
 
 
-@pytest.mark.parametrize("extent", ["exact", "inria"])
 @pytest.mark.parametrize("form", FORMS)
-def test_strange_values(form: str, extent: str) -> None:
+def test_strange_values(form: str) -> None:
     paired = PairedBackend(open_form(form), 3)
-    draw(paired, strange_scene(), make_camera(40, 24), extent=extent)
-    statistics = count(paired, strange_scene(), [make_camera(40, 24)], extent=extent)
+    draw(paired, strange_scene(), make_camera(40, 24))
+    statistics = count(paired, strange_scene(), [make_camera(40, 24)])
     culled = [0, 1, 3, 5, 9, 12, 14, 16, 17, 21, 22, 23, 29]
     assert not statistics.hits[culled].any()
     assert statistics.hits[[10, 11, 13, 15]].any()
@@ -277,9 +275,8 @@ def test_sums_beyond_32_bits(form: str) -> None:
     assert statistics.weights.max() > 2**33
 
 
-@pytest.mark.parametrize("extent", ["exact", "inria"])
 @pytest.mark.parametrize("form", FORMS)
-def test_antialiased_views(form: str, extent: str) -> None:
+def test_antialiased_views(form: str) -> None:
     """Opacity compensation: ordinary rows, needles, splats flat to the last bit, and rows at the ends of float32."""
     paired = PairedBackend(open_form(form), 3)
     rotation, translation = look_from(23)
@@ -290,5 +287,5 @@ def test_antialiased_views(form: str, extent: str) -> None:
     arrays["log_scales"][1, 100:150] = -12
     arrays["quats"][:, 50:110:3] = np.array([[1], [0], [1], [0]])
     for source in (MemorySource(arrays, 1), strange_scene(), random_scene(17, 24)):
-        assert draw(paired, source, camera, extent=extent, antialiased=True).any()
-        assert count(paired, source, [camera, make_camera(40, 24)], extent=extent, antialiased=True).hits.any()
+        assert draw(paired, source, camera, antialiased=True).any()
+        assert count(paired, source, [camera, make_camera(40, 24)], antialiased=True).hits.any()

@@ -75,9 +75,9 @@ def results(backend: OpenCLBackend | TwinBackend) -> Iterator[np.ndarray]:
     counting: Any = _Counting(backend)
     camera = make_camera(19, 16, focal=18)
     # More splats than a batch of the GPU form holds in one batch of pairs; a few in many batches.
-    for rows, pairs, extent in ((70, 1 << 8, "exact"), (9, 1, "inria")):
+    for rows, pairs in ((70, 1 << 8), (9, 1)):
         source = random_scene(rows, 3, 1, size=-1.2, opacity=-2)
-        drawer = Renderer(counting, large_budget(), background=(0.1, 0.2, 0.3), extent=extent, fit=Fit(pairs=pairs))
+        drawer = Renderer(counting, large_budget(), background=(0.1, 0.2, 0.3), fit=Fit(pairs=pairs))
         with drawer.load(source) as scene:
             yield drawer.render(scene, camera)
             statistics = Statistics.zeros(source.count)

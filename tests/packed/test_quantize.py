@@ -18,15 +18,13 @@ from flexgs_edge.packed.quantize import (
     group_bounds,
     group_count,
     group_of,
-    largest_error,
-    quantize_array,
     quantize_scene,
     quantized_bytes,
 )
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import MemorySource
-from quantized_scenes import assert_same_codes, make_scene, quantize_all
+from quantized_scenes import assert_same_codes, largest_error, make_scene, quantize_all, quantize_array
 
 ALL_BITS = range(1, 17)
 

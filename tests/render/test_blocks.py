@@ -43,9 +43,9 @@ def views() -> list[Camera]:
     ]
 
 
-def everything(form: str, extent: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndarray], list[int]]:
+def everything(form: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndarray], list[int]]:
     """All that views and sums over them give, with the blocks of each view or with all of them; and rows by view."""
-    renderer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
+    renderer = Renderer(open_form(form), large_budget(), antialiased=antialiased)
     source, found, counts = wide_scene(), list[np.ndarray](), list[int]()
     statistics = Statistics.zeros(ROWS)
     with renderer.load(source, references=True) as scene:
@@ -75,21 +75,21 @@ def everything(form: str, extent: str, antialiased: bool, blocks: bool) -> tuple
 
 
 @pytest.mark.parametrize(
-    ("form", "extent", "antialiased", "chunk_rows"),
+    ("form", "antialiased", "chunk_rows"),
     [
-        ("w16", "exact", False, 1 << 18),
-        ("w4", "exact", False, 2 * ROW_BLOCK + 64),
-        ("gpu", "inria", False, 3 * ROW_BLOCK),
-        ("w1", "exact", True, 640),
-        ("numpy", "exact", True, 640),
+        ("w16", False, 1 << 18),
+        ("w4", False, 2 * ROW_BLOCK + 64),
+        ("gpu", False, 3 * ROW_BLOCK),
+        ("w1", True, 640),
+        ("numpy", True, 640),
     ],
 )
 def test_blocks_out_of_sight_make_no_difference(
-    form: str, extent: str, antialiased: bool, chunk_rows: int, monkeypatch: pytest.MonkeyPatch
+    form: str, antialiased: bool, chunk_rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_fit(monkeypatch, chunk_rows=chunk_rows)
-    some, counts = everything(form, extent, antialiased, blocks=True)
-    everything_else, all_counts = everything(form, extent, antialiased, blocks=False)
+    some, counts = everything(form, antialiased, blocks=True)
+    everything_else, all_counts = everything(form, antialiased, blocks=False)
     assert all_counts == [ROWS] * 4
     assert counts[3] == 0 < counts[0] < ROWS
     for one, other in zip(some, everything_else, strict=True):

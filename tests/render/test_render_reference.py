@@ -11,12 +11,10 @@ import reference_renderer
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR
-from flexgs_edge.errors import InputError
 from flexgs_edge.kernels.twins.project import sh_basis
-from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from kernel_fixtures import ALL_FORMS, count, draw, large_budget, open_form, removal_costs, same_bits
+from kernel_fixtures import ALL_FORMS, count, draw, open_form, removal_costs, same_bits
 from reference_renderer import Reference
 from synthetic import SIZES, joined, look_from, make_camera, make_splats, random_scene
 
@@ -36,24 +34,23 @@ def assert_matches(
     reference: Reference,
     near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    extent: str = "exact",
     antialiased: bool = False,
 ) -> None:
     """Image within the bound where no decision is on the edge; hits and weights within what those decisions leave open."""
     backend = open_form(form)
-    image = draw(backend, source, camera, near, background, extent, antialiased)
+    image = draw(backend, source, camera, near, background, antialiased)
     difference = abs(image - reference.image).max(axis=2)
     assert np.isfinite(image).all()
     beyond = (difference - reference.bound)[~reference.fragile]
     assert (beyond <= 0).all(), beyond.max()
-    statistics = count(backend, source, [camera], near, extent, antialiased)
+    statistics = count(backend, source, [camera], near, antialiased)
     assert (abs(statistics.hits - reference.hits) <= reference.unsure).all()
     assert (abs(statistics.weight_sums - reference.weights) <= reference.weight_bound).all()
 
 
 @cache
 def random_case(
-    seed: int, degree: int, extent: str, antialiased: bool = False, size: float = -2.0
+    seed: int, degree: int, antialiased: bool = False, size: float = -2.0
 ) -> tuple[MemorySource, Camera, Reference]:
     rotation, translation = look_from(seed)
     camera = make_camera(45, 37, rotation=rotation, translation=translation)
@@ -61,24 +58,23 @@ def random_case(
     return (
         source,
         camera,
-        reference_renderer.render(source, camera, background=(0.2, 0.5, 1.0), extent=extent, antialiased=antialiased),
+        reference_renderer.render(source, camera, background=(0.2, 0.5, 1.0), antialiased=antialiased),
     )
 
 
-@pytest.mark.parametrize("extent", ["exact", "inria"])
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("form", ALL_FORMS)
-def test_random_scenes(form: str, degree: int, extent: str) -> None:
-    source, camera, reference = random_case(degree, degree, extent)
+def test_random_scenes(form: str, degree: int) -> None:
+    source, camera, reference = random_case(degree, degree)
     assert reference.fragile.mean() < 0.01 and np.median(reference.bound) < 2e-4  # otherwise this says nothing
-    assert_matches(form, source, camera, reference, background=(0.2, 0.5, 1.0), extent=extent)
+    assert_matches(form, source, camera, reference, background=(0.2, 0.5, 1.0))
 
 
 def test_rounding_is_small_and_flips_are_rare() -> None:
     """The bound above adds up the worst case. Roundings behave like noise: 1e-6 in the mean, 1e-5 of the tests flip at most."""
     tests, flips, lean, squares = 0, 0, 0, []
     for seed in range(20):
-        source, camera, reference = random_case(seed, seed % 5, "exact")
+        source, camera, reference = random_case(seed, seed % 5)
         image = draw(open_form("w16"), source, camera, background=(0.2, 0.5, 1.0))
         squares.append(np.square(image - reference.image)[~reference.fragile].mean())
         difference = count(open_form("w16"), source, [camera]).hits - reference.hits
@@ -170,8 +166,7 @@ def test_opacity_cull(form: str) -> None:
         source = make_splats(np.array([[0, 0, 4.0]]), np.array([[0.05] * 3]), opacity=opacity)
         reference = reference_renderer.render(source, camera)
         assert reference.hits.sum() == hits and not reference.unsure.any()
-        for extent in ("exact", "inria"):
-            assert count(open_form(form), source, [camera], extent=extent).hits.sum() == hits
+        assert count(open_form(form), source, [camera]).hits.sum() == hits
 
 
 @pytest.mark.parametrize("form", ALL_FORMS)
@@ -341,18 +336,6 @@ def test_rows_without_sh(form: str) -> None:
     assert same_bits(image, draw(open_form(form), MemorySource(arrays, 3, sh_count=31), camera))
 
 
-def test_inria_extent_differs() -> None:
-    """The reference rasteriser's tiles cut what the exact ellipse keeps, and keep what it cuts."""
-    source, camera = random_scene(40, 16, opacity=3), make_camera(64, 64)
-    exact, inria = (draw(open_form("w16"), source, camera, extent=extent) for extent in ("exact", "inria"))
-    assert 1e-4 < abs(exact - inria).max() < 0.05
-
-
-def test_unknown_extent() -> None:
-    with pytest.raises(InputError, match="extent 'round': expected one of exact, inria"):
-        Renderer(open_form("numpy"), large_budget(), extent="round")
-
-
 @pytest.mark.parametrize("degree", range(5))
 def test_sh_basis_of_the_twin(degree: int) -> None:
     """The written polynomials are the real spherical harmonics, signs and all."""
@@ -364,16 +347,15 @@ def test_sh_basis_of_the_twin(degree: int) -> None:
         np.testing.assert_allclose(ours, theirs, atol=2e-6)
 
 
-@pytest.mark.parametrize("extent", ["exact", "inria"])
 @pytest.mark.parametrize("size", [-2.0, -4.0])
 @pytest.mark.parametrize("form", ALL_FORMS)
-def test_antialiased_scenes(form: str, size: float, extent: str) -> None:
+def test_antialiased_scenes(form: str, size: float) -> None:
     """Opacity compensation, at a third of a pixel and at four pixels a splat, within the same bounds."""
-    source, camera, reference = random_case(1, 1, extent, True, size)
+    source, camera, reference = random_case(1, 1, True, size)
     assert reference.fragile.mean() < 0.01 and np.median(reference.bound) < 2e-4
-    plain = random_case(1, 1, extent, False, size)[2]
+    plain = random_case(1, 1, False, size)[2]
     assert reference.hits.sum() < (0.75 if size < -3 else 0.99) * plain.hits.sum()
-    assert_matches(form, source, camera, reference, background=(0.2, 0.5, 1.0), extent=extent, antialiased=True)
+    assert_matches(form, source, camera, reference, background=(0.2, 0.5, 1.0), antialiased=True)
 
 
 @pytest.mark.parametrize("form", ALL_FORMS)

@@ -13,7 +13,8 @@ import click
 import pytest
 
 from flexgs_edge.cli import app
-from flexgs_edge.cli.study.rate import RATIOS, command
+from flexgs_edge.cli.study import RATIOS
+from flexgs_edge.cli.study import rate as command
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate

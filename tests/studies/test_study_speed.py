@@ -13,7 +13,7 @@ import click
 import pytest
 
 from flexgs_edge.cli import app
-from flexgs_edge.cli.study.speed import command
+from flexgs_edge.cli.study import speed as command
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.report.plots import LineChart, Series, draw
 from flexgs_edge.run.options import CompressOptions

@@ -15,7 +15,7 @@ import click
 import pytest
 
 from flexgs_edge.cli import app
-from flexgs_edge.cli.study.stability import command
+from flexgs_edge.cli.study import stability as command
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.quality.psnr import mean_psnr
 from flexgs_edge.report.plots import BarChart, LineChart

@@ -1,9 +1,8 @@
-"""Read quantized scenes as sources, from memory or from a version 1 file."""
+"""Read a version 1 file as a scene source."""
 
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,60 +12,11 @@ from flexgs_edge.codec.v1.container import Container
 from flexgs_edge.codec.v1.header import CHUNK_ROWS
 from flexgs_edge.packed.bitpack import plane_bytes
 from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, dequantize_part
-from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
 
-class CodedSource(SceneSource):
-    """A scene whose codes are dequantized when they are read."""
-
-    contraction: Contraction | None
-
-    @abstractmethod
-    def quantized(self) -> QuantizedScene:
-        """The codes and ranges of the whole scene."""
-
-    @abstractmethod
-    def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
-        """The arrays with the rows of a chunk, and the row at which their planes start."""
-
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`.
-
-        A chunk is dequantized from the first to the last of its rows, also if they are sparse.
-        """
-        rows, planes = self.begin_read(rows, fields, out)
-        for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
-            first, arrays = self._chunk(chunk)
-            for field, plane in planes.items():
-                _fill(arrays[field], first, wanted, plane[:, place])
-                if field == "means" and self.contraction is not None:
-                    plane[:, place] = self.contraction.expand(plane[:, place])
-        return planes
-
-
-class QuantizedSource(CodedSource):
-    """A quantized scene in memory, as a scene source.
-
-    `scene`: not copied. `name`: name of the scene in messages.
-    """
-
-    def __init__(self, scene: QuantizedScene, name: str = "quantized scene") -> None:
-        self.name, self.notes = name, ()
-        self.count, self.sh_degree, self.sh_count = scene.count, scene.sh_degree, scene.sh_count
-        self.origin, self.contraction = scene.origin, scene.contraction
-        self._scene = scene
-
-    def quantized(self) -> QuantizedScene:
-        """See `CodedSource.quantized`; returns the given scene."""
-        return self._scene
-
-    def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
-        return 0, self._scene.arrays
-
-
-class FgsSource(CodedSource):
+class FgsSource(SceneSource):
     """A version 1 file as a scene. Memory holds the ranges and the last chunk; a chunk is read and checked when needed.
 
     `path`: the file. `settings`: how the file was made. Raises `FormatError` if the file differs from the format; a
@@ -84,8 +34,22 @@ class FgsSource(CodedSource):
         self._table = self.container.read_chunk_table()
         self._last: tuple[int, dict[str, QuantizedArray]] | None = None
 
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        """See `SceneSource.read`.
+
+        A chunk is dequantized from the first to the last of its rows, also if they are sparse.
+        """
+        rows, planes = self.begin_read(rows, fields, out)
+        for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
+            first, arrays = self._chunk(chunk)
+            for field, plane in planes.items():
+                _fill(arrays[field], first, wanted, plane[:, place])
+                if field == "means" and self.contraction is not None:
+                    plane[:, place] = self.contraction.expand(plane[:, place])
+        return planes
+
     def quantized(self) -> QuantizedScene:
-        """See `CodedSource.quantized`; this reads and checks every chunk of the file."""
+        """The codes and ranges of the whole scene; this reads and checks every chunk of the file."""
         header = self.container.header
         arrays = {
             field.name: self._array(
@@ -103,6 +67,7 @@ class FgsSource(CodedSource):
         return QuantizedScene(self.count, self.sh_count, self.sh_degree, self.origin, arrays, self.contraction)
 
     def _chunk(self, chunk: int) -> tuple[int, dict[str, QuantizedArray]]:
+        """The arrays with the rows of a chunk, and the row at which their planes start."""
         if self._last is None or self._last[0] != chunk:
             self._last = None  # freed before the next chunk is read, so that memory holds one chunk
             self._last = (chunk, self._cut(chunk, self.container.read_chunk(self._table[chunk])))

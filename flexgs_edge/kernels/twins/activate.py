@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import ALPHA_MIN, FACTOR_MIN, LOG2_E
-from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, flog2, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32, fexp2, flog2, fma
 
 
 def activate(
-    size: tuple[int, ...],
+    size: Size,
     stride: int,
     antialiased: int,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    logits: np.ndarray,
-    cov: np.ndarray,
-    log2_opacity: np.ndarray,
+    log_scales: Array,
+    quats: Array,
+    logits: Array,
+    cov: Array,
+    log2_opacity: Array,
 ) -> None:
     """Compute the 3D covariance or its factor ([6, stride]), and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
     s0, s1, s2 = (fexp2(row * f32(LOG2_E)) for row in log_scales)
@@ -40,7 +40,7 @@ def activate(
     log2_opacity[:] = np.where(opacity >= f32(ALPHA_MIN), level, f32(-np.inf))
 
 
-def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[np.ndarray]:
+def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[Array]:
     """Lower triangle F (xx yx zx yy zy zz) with F F^T = M M^T, from the rows of M."""
     xx = dot3(*m0, *m0)
     u = _direction(m0, xx)
@@ -53,10 +53,10 @@ def _factor(m0: Triple, m1: Triple, m2: Triple) -> list[np.ndarray]:
     return [np.sqrt(xx), yx, zx, np.sqrt(yy), zy, np.sqrt(dot3(*m2, *m2))]
 
 
-def _direction(row: Triple, square: np.ndarray) -> Triple:
+def _direction(row: Triple, square: Array) -> Triple:
     inverse = np.where(square > f32(FACTOR_MIN), f32(1) / np.sqrt(square), f32(0))
     return row[0] * inverse, row[1] * inverse, row[2] * inverse
 
 
-def _without(row: Triple, part: np.ndarray, u: Triple) -> Triple:
+def _without(row: Triple, part: Array, u: Triple) -> Triple:
     return fma(-part, u[0], row[0]), fma(-part, u[1], row[1]), fma(-part, u[2], row[2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import FACTOR_MIN, FIXED_MOMENT, FIXED_WEIGHT, LOG2_E, SH_C0, SH_C1, SH_C2, SH_C3, SH_C4
-from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, fexp2, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32, fexp2, fma
 from flexgs_edge.kernels.twins.project import sh_basis
 
 AT_SCALE, AT_QUAT, AT_LOGIT, AT_DC, AT_SH = 3, 6, 10, 11, 14
@@ -14,7 +14,7 @@ AT_SCALE, AT_QUAT, AT_LOGIT, AT_DC, AT_SH = 3, 6, 10, 11, 14
 _LN2 = f32(1) / f32(LOG2_E)
 
 
-def sh_slopes(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[Triple]:
+def sh_slopes(degree: int, x: Array, y: Array, z: Array) -> list[Triple]:
     """Derivatives of the basis functions above degree 0, in the written forms of sh.clh."""
     none = np.zeros_like(x)
     slopes: list[Triple] = []
@@ -63,24 +63,24 @@ def sh_slopes(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[
 
 
 def project_backward(
-    size: tuple[int, ...],
+    size: Size,
     count: int,
     stride: int,
     base: int,
     degree: int,
     antialiased: int,
     wide: float,
-    camera: np.ndarray,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    logits: np.ndarray,
-    sh_rest: np.ndarray,
-    degrees: np.ndarray,
-    records: np.ndarray,
-    sums: np.ndarray,
-    pace: np.ndarray,
-    gradient: np.ndarray,
+    camera: Array,
+    means: Array,
+    log_scales: Array,
+    quats: Array,
+    logits: Array,
+    sh_rest: Array,
+    degrees: Array,
+    records: Array,
+    sums: Array,
+    pace: Array,
+    gradient: Array,
 ) -> None:
     """Gradients ([14 + 3 K, stride]) of the rows that the view shows, and the share of a whole step that they take ([stride]).
 
@@ -105,24 +105,18 @@ def project_backward(
     gradient[:, rows] = out
 
 
-def _pace(wide: float, cam: np.ndarray, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+def _pace(wide: float, cam: Array, means: Array, log_scales: Array) -> Array:
     """Share of a whole step that each row takes ([n])."""
     px, py, pz = means
     iz = f32(1) / (fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11])
     size = fexp2(log_scales * f32(LOG2_E)).max(axis=0) * iz
-    share: np.ndarray = np.where(size > f32(wide), f32(wide) / size, f32(1))
+    share: Array = np.where(size > f32(wide), f32(wide) / size, f32(1))
     return share
 
 
 def _colours(
-    degree: int,
-    cam: np.ndarray,
-    means: np.ndarray,
-    sh_rest: np.ndarray,
-    degrees: np.ndarray,
-    record: np.ndarray,
-    moments: np.ndarray,
-) -> tuple[np.ndarray, Triple]:
+    degree: int, cam: Array, means: Array, sh_rest: Array, degrees: Array, record: Array, moments: Array
+) -> tuple[Array, Triple]:
     """Gradients of the constant and of SH ([3 + 3 K, n]), and of the centre through the direction of view."""
     dx, dy, dz = (means[k] - cam[21 + k] for k in range(3))
     norm = f32(1) / np.sqrt(dot3(dx, dy, dz, dx, dy, dz))
@@ -146,14 +140,14 @@ def _colours(
 
 def _geometry(
     antialiased: int,
-    cam: np.ndarray,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    record: np.ndarray,
-    moments: np.ndarray,
+    cam: Array,
+    means: Array,
+    log_scales: Array,
+    quats: Array,
+    record: Array,
+    moments: Array,
     toward: Triple,
-) -> np.ndarray:
+) -> Array:
     """Gradients of means, log-scales and quaternions ([10, n])."""
     one, two = f32(1), f32(2)
     s = [fexp2(row * f32(LOG2_E)) for row in log_scales]

@@ -21,7 +21,7 @@ from flexgs_edge.constants import (
     TILE,
     TRANSMITTANCE_MIN,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, fma, splat_exponent
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fexp2_within, fma, splat_exponent
 
 TILES_AT_ONCE = 256
 """Tiles of a group. It bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed
@@ -35,12 +35,12 @@ _LANE_X, _LANE_Y = (_LANE % BLOCK).astype(f32), (_LANE // BLOCK).astype(f32)
 class _Lists:
     """The splats of each block: those of block u are entries [starts[u], starts[u] + counts[u]) of `pair`."""
 
-    pair: np.ndarray
-    starts: np.ndarray
-    counts: np.ndarray
+    pair: Array
+    starts: Array
+    counts: Array
 
 
-def _block_lists(tile: np.ndarray, masks: np.ndarray, tiles: int) -> _Lists:
+def _block_lists(tile: Array, masks: Array, tiles: int) -> _Lists:
     pair, block = np.nonzero(masks[:, None] >> np.arange(16, dtype=np.uint32) & np.uint32(1))
     unit = tile[pair] * 16 + block
     order = np.argsort(unit, kind="stable")
@@ -56,19 +56,19 @@ class _Entries:
     splat's centre.
     """
 
-    hit: np.ndarray
-    weight: np.ndarray
-    error: np.ndarray
-    place: np.ndarray
+    hit: Array
+    weight: Array
+    error: Array
+    place: Array
 
 
-def _fixed(lanes: np.ndarray, unit: float, tiles: int) -> np.ndarray:
+def _fixed(lanes: Array, unit: float, tiles: int) -> Array:
     """[pairs] i64, sums of [pairs, 16] lanes: the pairwise tree, then fixed point, clamped to a tile's part of 64 bits."""
     largest = f32(FIXED_LARGEST / 2.0 ** tiles.bit_length())
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
-    fixed: np.ndarray = np.clip(total * f32(unit), -largest, largest).astype(np.int64)
+    fixed: Array = np.clip(total * f32(unit), -largest, largest).astype(np.int64)
     return fixed
 
 
@@ -85,7 +85,7 @@ UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][
 """Units of the planes whose unit is not 1 / FIXED_WEIGHT."""
 
 
-def _add_moments(lanes: dict[str, np.ndarray], pair: np.ndarray, slope: np.ndarray, place: np.ndarray) -> None:
+def _add_moments(lanes: dict[str, Array], pair: Array, slope: Array, place: Array) -> None:
     """Add gradients of the exponent, times powers of the pixel's place, in the kernel's order."""
     dx, dy = place
     slope_x, slope_y = slope * dx, slope * dy
@@ -100,10 +100,10 @@ def _add_sums(
     tiles: int,
     lists: _Lists,
     entries: _Entries,
-    rest: np.ndarray | None,
-    rows_of: np.ndarray,
-    hits: np.ndarray,
-    sums: np.ndarray,
+    rest: Array | None,
+    rows_of: Array,
+    hits: Array,
+    sums: Array,
 ) -> None:
     """Add to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
 
@@ -136,7 +136,7 @@ def _add_sums(
 
 
 def blend(
-    size: tuple[int, ...],
+    size: Size,
     tiles_x: int,
     blocks: int,
     width: int,
@@ -146,14 +146,14 @@ def blend(
     background_r: float,
     background_g: float,
     background_b: float,
-    ends: np.ndarray,
-    pairs: np.ndarray,
-    records: np.ndarray,
-    state: np.ndarray,
-    image: np.ndarray,
-    hits: np.ndarray | None = None,
-    sums: np.ndarray | None = None,
-    rest: np.ndarray | None = None,
+    ends: Array,
+    pairs: Array,
+    records: Array,
+    state: Array,
+    image: Array,
+    hits: Array | None = None,
+    sums: Array | None = None,
+    rest: Array | None = None,
     stats: int = 0,
 ) -> None:
     """Blend the tile lists into `state`, and in the end into `image` ([3, padded height, padded width]).
@@ -198,14 +198,14 @@ def blend(
 
 def _blend_blocks(
     lists: _Lists,
-    rows_of: np.ndarray,
-    records: np.ndarray,
-    pixels: tuple[np.ndarray, np.ndarray],
-    colour: np.ndarray,
-    trans: np.ndarray,
+    rows_of: Array,
+    records: Array,
+    pixels: tuple[Array, Array],
+    colour: Array,
+    trans: Array,
     stats: int,
-    whole: np.ndarray | None,
-    rest: np.ndarray | None,
+    whole: Array | None,
+    rest: Array | None,
 ) -> _Entries | None:
     """Blend every block's list into `colour` and `trans`; returns the entries for statistics if they are asked for."""
     shape = (len(lists.pair) if stats else 0, 16)

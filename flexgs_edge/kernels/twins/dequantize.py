@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexgs_edge.kernels.twins.arithmetic import Array, Size
+
 
 def dequantize(
-    size: tuple[int, ...],
+    size: Size,
     count: int,
     groups: int,
     bits: int,
@@ -14,10 +16,10 @@ def dequantize(
     first: int,
     rows: int,
     stride: int,
-    planes: np.ndarray,
-    low: np.ndarray,
-    step: np.ndarray,
-    values: np.ndarray,
+    planes: Array,
+    low: Array,
+    step: Array,
+    values: Array,
 ) -> None:
     """Dequantize rows [first, first + rows) of every channel into `values` ([channels, stride])."""
     row = np.arange(first, first + rows, dtype=np.int64)

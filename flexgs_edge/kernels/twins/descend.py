@@ -6,18 +6,16 @@ import numpy as np
 
 from flexgs_edge.constants import GRADIENT_MIN
 from flexgs_edge.kernels.twins.activate import activate
-from flexgs_edge.kernels.twins.arithmetic import f32, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fma
 from flexgs_edge.kernels.twins.backward import AT_DC, AT_LOGIT, AT_QUAT, AT_SCALE, AT_SH
 
 
-def _pull(away: np.ndarray, price: np.float32, width: np.float32) -> np.ndarray:
-    pulled: np.ndarray = price * away / (np.abs(away) + width)
+def _pull(away: Array, price: np.float32, width: np.float32) -> Array:
+    pulled: Array = price * away / (np.abs(away) + width)
     return pulled
 
 
-def price_bits(
-    degree: int, prices: np.ndarray, degrees: np.ndarray, pace: np.ndarray, values: np.ndarray, gradient: np.ndarray
-) -> None:
+def price_bits(degree: int, prices: Array, degrees: Array, pace: Array, values: Array, gradient: Array) -> None:
     """Add what the bits of values cost to their gradients ([14 + 3 K, stride]), in rows that have gradients.
 
     `prices` is the record of `flexgs_edge.methods.best.refit.descent.bit_prices`.
@@ -51,13 +49,13 @@ def adam(
     planes: int,
     decay_first: float,
     decay_second: float,
-    rates: np.ndarray,
-    pace: np.ndarray,
-    gradient: np.ndarray,
-    powers: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    values: np.ndarray,
+    rates: Array,
+    pace: Array,
+    gradient: Array,
+    powers: Array,
+    first: Array,
+    second: Array,
+    values: Array,
 ) -> None:
     """One step of Adam for the rows with a share above 0; running means, powers of the decays and values change in place."""
     rows = np.flatnonzero(pace > 0)
@@ -78,27 +76,27 @@ def adam(
         values[k, rows] = fma(-rates[k] * pace[rows], step, values[k, rows])
 
 
-def follow(size: tuple[int, ...], stride: int, planes: int, share: float, values: np.ndarray, mean: np.ndarray) -> None:
+def follow(size: Size, stride: int, planes: int, share: float, values: Array, mean: Array) -> None:
     """Move a running mean of values towards them by a share, in place; a share of 1 begins it anew."""
     mean[:planes] = fma(f32(share), values[:planes] - mean[:planes], mean[:planes]) if share < 1 else values[:planes]
 
 
-def _on_grid(values: np.ndarray, step: np.float32) -> np.ndarray:
+def _on_grid(values: Array, step: np.float32) -> Array:
     return np.rint(values / step) * step if step > 0 else values
 
 
 def snap(
-    size: tuple[int, ...],
+    size: Size,
     stride: int,
     degree: int,
-    steps: np.ndarray,
-    values: np.ndarray,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    logits: np.ndarray,
-    sh_dc: np.ndarray,
-    sh_rest: np.ndarray,
+    steps: Array,
+    values: Array,
+    means: Array,
+    log_scales: Array,
+    quats: Array,
+    logits: Array,
+    sh_dc: Array,
+    sh_rest: Array,
 ) -> None:
     """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to.
 
@@ -133,7 +131,7 @@ def snap(
 
 
 def descend(
-    size: tuple[int, ...],
+    size: Size,
     stride: int,
     degree: int,
     planes: int,
@@ -143,25 +141,25 @@ def descend(
     decay_first: float,
     decay_second: float,
     share: float,
-    rates: np.ndarray,
-    prices: np.ndarray,
-    steps: np.ndarray,
-    degrees: np.ndarray,
-    pace: np.ndarray,
-    gradient: np.ndarray,
-    powers: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
-    values: np.ndarray,
-    mean: np.ndarray,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    quats: np.ndarray,
-    logits: np.ndarray,
-    sh_dc: np.ndarray,
-    sh_rest: np.ndarray,
-    cov: np.ndarray,
-    log2_opacity: np.ndarray,
+    rates: Array,
+    prices: Array,
+    steps: Array,
+    degrees: Array,
+    pace: Array,
+    gradient: Array,
+    powers: Array,
+    first: Array,
+    second: Array,
+    values: Array,
+    mean: Array,
+    means: Array,
+    log_scales: Array,
+    quats: Array,
+    logits: Array,
+    sh_dc: Array,
+    sh_rest: Array,
+    cov: Array,
+    log2_opacity: Array,
 ) -> None:
     """`price_bits` if `priced`, `adam`, `follow` if it `follows`, `snap` and `activate`, one after the other."""
     if priced:

@@ -16,23 +16,23 @@ from flexgs_edge.constants import (
     FLIP_RGB,
     FLIP_XYZ,
 )
-from flexgs_edge.kernels.twins.arithmetic import f32, fexp2_within, flog2
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fexp2_within, flog2
 
 
-def flip_power(x: np.ndarray, p: np.ndarray | np.float32) -> np.ndarray:
+def flip_power(x: Array, p: Array | np.float32) -> Array:
     """x^p for 0 <= x <= 1000 and 0 <= p <= 3."""
     none = x < f32(FLIP_LEAST)
     return np.where(none, f32(0), fexp2_within(p * flog2(np.where(none, f32(1), x))))
 
 
-def _mix(parts: list[np.ndarray], weights: tuple[float, ...]) -> list[np.ndarray]:
+def _mix(parts: list[Array], weights: tuple[float, ...]) -> list[Array]:
     """A 3x3 matrix, row by row, times three arrays."""
     r, g, b = parts
     rows = (map(f32, weights[at : at + 3]) for at in (0, 3, 6))
     return [(wr * r + wg * g) + wb * b for wr, wg, wb in rows]
 
 
-def flip_colours(size: tuple[int, ...], count: int, plane: int, planes: np.ndarray) -> None:
+def flip_colours(size: Size, count: int, plane: int, planes: Array) -> None:
     """SRGB in [0, 1] becomes light, red against green and yellow against blue: Y, X - Y and Y - Z ([3, plane])."""
     linear = []
     for s in planes[:, :count]:
@@ -42,7 +42,7 @@ def flip_colours(size: tuple[int, ...], count: int, plane: int, planes: np.ndarr
     planes[:, :count] = y, x - y, y - z
 
 
-def _filter(values: np.ndarray, taps: np.ndarray, step: int, count: int, reach: int) -> np.ndarray:
+def _filter(values: Array, taps: Array, step: int, count: int, reach: int) -> Array:
     """Sums value * tap over 2 * `reach` + 1 elements `step` apart, for every element ([count])."""
     total = np.zeros(count, f32)
     for k in range(FLIP_REACH - reach, FLIP_REACH + reach + 1):
@@ -51,14 +51,7 @@ def _filter(values: np.ndarray, taps: np.ndarray, step: int, count: int, reach: 
 
 
 def flip_columns(
-    size: tuple[int, ...],
-    count: int,
-    stride: int,
-    plane: int,
-    filtered: int,
-    taps: np.ndarray,
-    planes: np.ndarray,
-    columns: np.ndarray,
+    size: Size, count: int, stride: int, plane: int, filtered: int, taps: Array, planes: Array, columns: Array
 ) -> None:
     """The planes filtered along the columns ([7, filtered]), by taps [7, 2 FLIP_REACH + 1]."""
     fine, wide, feature = FLIP_FINE_REACH, FLIP_REACH, FLIP_FEATURE_REACH
@@ -67,19 +60,17 @@ def flip_columns(
         to[:count] = _filter(planes[channel], tap, stride, count, reach)
 
 
-def _curve(t: np.ndarray) -> np.ndarray:
+def _curve(t: Array) -> Array:
     """CIE's lightness curve of one of X, Y, Z."""
     edge = f32(6) / f32(29)
     root = flip_power(t, f32(1) / f32(3))
     return np.where(t > edge * edge * edge, root, t / (f32(3) * edge * edge) + f32(4) / f32(29))
 
 
-def flip_rows(
-    size: tuple[int, ...], count: int, filtered: int, taps: np.ndarray, columns: np.ndarray, seen: np.ndarray
-) -> None:
+def flip_rows(size: Size, count: int, filtered: int, taps: Array, columns: Array, seen: Array) -> None:
     """What is compared ([5, count]): L, a and b of the filtered colour, strength of edges and of points."""
 
-    def along(column: int, tap: int, reach: int) -> np.ndarray:
+    def along(column: int, tap: int, reach: int) -> Array:
         return _filter(columns[column], taps[tap], 1, count, reach)
 
     light, red = along(0, 0, FLIP_FINE_REACH), along(1, 1, FLIP_FINE_REACH)
@@ -97,7 +88,7 @@ def flip_rows(
     seen[4] = np.sqrt(point_x * point_x + point_y * point_y)
 
 
-def flip_pair(size: tuple[int, ...], count: int, one: np.ndarray, two: np.ndarray, flip: np.ndarray) -> None:
+def flip_pair(size: Size, count: int, one: Array, two: Array, flip: Array) -> None:
     """FLIP of two pictures ([count]): the difference of colours, raised by that of edges and points."""
     away = one - two
     colour = np.abs(away[0]) + np.sqrt(away[1] * away[1] + away[2] * away[2])

@@ -16,19 +16,18 @@ from flexgs_edge.constants import (
     SH_C3,
     SH_C4,
     SHARE_MIN,
-    SIGMA_RADIUS_INRIA,
     SPAN_SLACK,
     SPAN_SLACK_RELATIVE,
     TILE,
 )
-from flexgs_edge.kernels.twins.arithmetic import Triple, dot3, f32, flog2, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32, flog2, fma
 
 _LOG2_E = f32(LOG2_E)
 
 
-def sh_basis(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[np.ndarray]:
+def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
     """Basis functions above degree 0 in unit directions (x, y, z), in the written forms of project.cl."""
-    basis: list[np.ndarray] = []
+    basis: list[Array] = []
     if degree > 0:
         c1 = f32(SH_C1)
         basis += [-c1 * y, c1 * z, -c1 * x]
@@ -65,31 +64,20 @@ def sh_basis(degree: int, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> list[n
     return basis
 
 
-def block_rows(blocks: np.ndarray, first: int, count: int) -> np.ndarray:
+def block_rows(blocks: Array, first: int, count: int) -> Array:
     """[count] i64, the rows of a chunk in its part of a view: those of `blocks` from place `first` on."""
     some = blocks[first : first - (-count // ROW_BLOCK)].astype(np.int64)
-    rows: np.ndarray = (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
+    rows: Array = (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
     return rows
 
 
-def _bounds(
-    inria_extent: int,
-    mx: np.ndarray,
-    my: np.ndarray,
-    half: tuple[np.ndarray, np.ndarray],
-    radius: np.ndarray,
-    cam: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tuple[Array, Array]:
     """Number of tiles of the bounding box, and whether there are any."""
     per_tile, spans = f32(1.0 / TILE), []
     for centre, half_extent, slack_factor, pixels in ((mx, half[0], f32(2), cam[24]), (my, half[1], f32(1), cam[25])):
-        if inria_extent:
-            first = np.floor((centre - radius) * per_tile)
-            last = np.floor((centre + radius + f32(TILE - 1)) * per_tile) - f32(1)
-        else:
-            slack = slack_factor * fma(half_extent, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
-            first = np.floor(np.ceil(centre - half_extent - slack) * per_tile)
-            last = np.floor(np.floor(centre + half_extent + slack) * per_tile)
+        slack = slack_factor * fma(half_extent, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+        first = np.floor(np.ceil(centre - half_extent - slack) * per_tile)
+        last = np.floor(np.floor(centre + half_extent + slack) * per_tile)
         first = np.fmax(first, f32(0))
         last = np.fmin(last, np.floor((pixels - f32(1)) * per_tile))
         spans.append((first, last))
@@ -97,9 +85,7 @@ def _bounds(
     return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0)
 
 
-def _from_covariance(
-    cov: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _from_covariance(cov: Array, t0: Triple, t1: Triple, dilation: np.float32) -> tuple[Array, Array, Array, Array]:
     """Entries a, b, c and the determinant of the dilated 2D covariance, from the 3D covariance."""
     cxx, cxy, cxz, cyy, cyz, czz = cov
     v0 = (dot3(cxx, cxy, cxz, *t0), dot3(cxy, cyy, cyz, *t0), dot3(cxz, cyz, czz, *t0))
@@ -111,8 +97,8 @@ def _from_covariance(
 
 
 def _from_factor(
-    factor: np.ndarray, t0: Triple, t1: Triple, dilation: np.float32
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    factor: Array, t0: Triple, t1: Triple, dilation: np.float32
+) -> tuple[Array, Array, Array, Array, Array]:
     """As `_from_covariance`, from the triangular factor.
 
     It also gives the determinant before the dilation, as a share of that after it.
@@ -127,24 +113,23 @@ def _from_factor(
 
 
 def project(
-    size: tuple[int, ...],
+    size: Size,
     count: int,
     stride: int,
     base: int,
     first: int,
     degree: int,
-    inria_extent: int,
     antialiased: int,
-    blocks: np.ndarray,
-    camera: np.ndarray,
-    means: np.ndarray,
-    cov: np.ndarray,
-    log2_opacity: np.ndarray,
-    sh_dc: np.ndarray,
-    sh_rest: np.ndarray,
-    records: np.ndarray,
-    keys: np.ndarray,
-    bounds: np.ndarray,
+    blocks: Array,
+    camera: Array,
+    means: Array,
+    cov: Array,
+    log2_opacity: Array,
+    sh_dc: Array,
+    sh_rest: Array,
+    records: Array,
+    keys: Array,
+    bounds: Array,
 ) -> None:
     """Project the rows of some blocks to splat records ([N, 16]), depth keys and bounds ([N]) from row `base` on."""
     cam, own = camera, block_rows(blocks, first, count)
@@ -173,25 +158,19 @@ def project(
         a, b, c, det = _from_covariance(cov[:, own], t0, t1, cam[26])
     t2 = np.fmax((level + (f32(LOG2_255) + f32(EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
     half = (np.sqrt(t2 * a), np.sqrt(t2 * c))
-    reach, radius = half, np.zeros_like(a)
-    if inria_extent:
-        mid = f32(0.5) * (a + c)
-        spread = np.sqrt(np.fmax(f32(0.1), mid * mid - det))
-        radius = np.ceil(f32(SIGMA_RADIUS_INRIA) * np.sqrt(mid + spread))
-        reach = (radius + f32(TILE), radius + f32(TILE))
     shown &= (det > 0) & (det < np.inf) & (a < np.inf) & (c < np.inf)
-    shown &= (mx + reach[0] >= f32(-1)) & (mx - reach[0] <= cam[24])
-    shown &= (my + reach[1] >= f32(-1)) & (my - reach[1] <= cam[25])
+    shown &= (mx + half[0] >= f32(-1)) & (mx - half[0] <= cam[24])
+    shown &= (my + half[1] >= f32(-1)) & (my - half[1] <= cam[25])
 
     k = (f32(1) / det) * (f32(0.5) * _LOG2_E)
     ic = f32(1) / c
-    tiles, some = _bounds(inria_extent, mx, my, half, radius, cam)
+    tiles, some = _bounds(mx, my, half, cam)
     shown &= some
 
     rows = np.flatnonzero(shown)
     colours = _colours(rows, degree, cam, (px, py, pz), sh_dc[:, own], sh_rest[:, own])
     out = [mx, my, c * k, -(b + b) * k, a * k, level, *colours]
-    out += [(b / a) * half[0], half[1], b * ic, ic, det * ic, t2, radius]
+    out += [(b / a) * half[0], half[1], b * ic, ic, det * ic, t2, np.zeros_like(a)]
     for field, values in enumerate(out):
         records[base + rows, field] = values if 6 <= field <= 8 else values[rows]
     keys[base : base + count] = np.where(shown, z.view(np.uint32), np.uint32(CULLED))
@@ -199,13 +178,8 @@ def project(
 
 
 def _colours(
-    rows: np.ndarray,
-    degree: int,
-    cam: np.ndarray,
-    position: tuple[np.ndarray, np.ndarray, np.ndarray],
-    sh_dc: np.ndarray,
-    sh_rest: np.ndarray,
-) -> list[np.ndarray]:
+    rows: Array, degree: int, cam: Array, position: tuple[Array, Array, Array], sh_dc: Array, sh_rest: Array
+) -> list[Array]:
     dx, dy, dz = (p[rows] - cam[21 + k] for k, p in enumerate(position))
     norm = f32(1) / np.sqrt(dot3(dx, dy, dz, dx, dy, dz))
     basis = sh_basis(degree, dx * norm, dy * norm, dz * norm)

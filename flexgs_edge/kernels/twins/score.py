@@ -5,45 +5,45 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import FIXED_ERROR, FIXED_LARGEST, FIXED_WEIGHT, SH_C0
-from flexgs_edge.kernels.twins.arithmetic import dot3, f32, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, dot3, f32, fma
 from flexgs_edge.kernels.twins.project import block_rows, sh_basis
 
 
-def residual(size: tuple[int, ...], count: int, target: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
+def residual(size: Size, count: int, target: Array, image: Array, out: Array) -> None:
     """`target` (f16) minus `image` (f32), pixel by pixel."""
     out[:] = target.astype(f32) - image.reshape(-1)
 
 
-def _sum_values(sums: np.ndarray, unit: float) -> np.ndarray:
+def _sum_values(sums: Array, unit: float) -> Array:
     return sums.view(np.int64)[:, 0].astype(f32) * f32(unit)
 
 
-def _directions(camera: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _directions(camera: Array, means: Array) -> tuple[Array, Array, Array]:
     dx, dy, dz = (means[k] - camera[21 + k] for k in range(3))
     norm = f32(1) / np.sqrt(dot3(dx, dy, dz, dx, dy, dz))
     return dx * norm, dy * norm, dz * norm
 
 
-def _add_long(acc: np.ndarray, value: np.ndarray) -> None:
+def _add_long(acc: Array, value: Array) -> None:
     value = np.clip(value * f32(FIXED_WEIGHT), f32(-FIXED_LARGEST), f32(FIXED_LARGEST)).astype(np.int64)
     most = np.iinfo(np.int64)
     value = np.minimum(value, most.max - np.maximum(acc, 0))
     acc += np.maximum(value, most.min - np.minimum(acc, 0))
 
 
-def _planes_first(sums: np.ndarray) -> np.ndarray:
+def _planes_first(sums: Array) -> Array:
     """Sums over views as [planes, stride], a copy; from [stride / SUM_LANES, planes, SUM_LANES]."""
     groups, *_, lanes = sums.shape
     return np.moveaxis(sums.reshape(groups, -1, lanes), 1, 0).reshape(-1, groups * lanes)
 
 
-def _put_back(sums: np.ndarray, planes: np.ndarray) -> None:
+def _put_back(sums: Array, planes: Array) -> None:
     groups, *_, lanes = sums.shape
     sums[...] = np.moveaxis(planes.reshape(-1, groups, lanes), 0, 1).reshape(sums.shape)
 
 
 def add_costs(
-    size: tuple[int, ...],
+    size: Size,
     count: int,
     stride: int,
     base: int,
@@ -51,12 +51,12 @@ def add_costs(
     degree: int,
     planes: int,
     plane: int,
-    blocks: np.ndarray,
-    camera: np.ndarray,
-    means: np.ndarray,
-    sh_rest: np.ndarray,
-    sums: np.ndarray,
-    costs: np.ndarray,
+    blocks: Array,
+    camera: Array,
+    means: Array,
+    sh_rest: Array,
+    sums: Array,
+    costs: Array,
 ) -> None:
     """Add squared errors and squared weights of a view to 128-bit sums, and the moments w2 d and w2 |d|^2.
 
@@ -91,18 +91,18 @@ def add_costs(
 
 
 def sh_residual(
-    size: tuple[int, ...],
+    size: Size,
     count: int,
     stride: int,
     base: int,
     first: int,
     degree: int,
     planes: int,
-    blocks: np.ndarray,
-    camera: np.ndarray,
-    means: np.ndarray,
-    sums: np.ndarray,
-    normal: np.ndarray,
+    blocks: Array,
+    camera: Array,
+    means: Array,
+    sums: Array,
+    normal: Array,
 ) -> None:
     """Add Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([stride / SUM_LANES, K + 1, 4, SUM_LANES])."""
     own, span = block_rows(blocks, first, count), slice(base, base + count)

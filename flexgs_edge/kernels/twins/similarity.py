@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import SSIM_C1, SSIM_C2, SSIM_WINDOW
-from flexgs_edge.kernels.twins.arithmetic import f32
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32
 
 
-def _columns(count: int, stride: int, taps: np.ndarray, a: np.ndarray, b: np.ndarray, moments: np.ndarray) -> None:
+def _columns(count: int, stride: int, taps: Array, a: Array, b: Array, moments: Array) -> None:
     sums = moments[:, :count]
     sums[:] = 0
     for k, tap in enumerate(taps):
@@ -19,22 +19,13 @@ def _columns(count: int, stride: int, taps: np.ndarray, a: np.ndarray, b: np.nda
 
 
 def ssim_columns(
-    size: tuple[int, ...],
-    count: int,
-    stride: int,
-    plane: int,
-    taps: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-    moments: np.ndarray,
+    size: Size, count: int, stride: int, plane: int, taps: Array, a: Array, b: Array, moments: Array
 ) -> None:
     """Moments of a, b, a a, b b and a b, windowed along the columns ([5, plane])."""
     _columns(count, stride, taps, a.reshape(-1), b.reshape(-1), moments)
 
 
-def ssim_rows(
-    size: tuple[int, ...], count: int, plane: int, taps: np.ndarray, moments: np.ndarray, similar: np.ndarray
-) -> None:
+def ssim_rows(size: Size, count: int, plane: int, taps: Array, moments: Array, similar: Array) -> None:
     """SSIM of every element ([count]), from the moments, windowed along the rows too."""
     m = np.zeros((5, count), f32)
     for k in range(SSIM_WINDOW):
@@ -45,15 +36,15 @@ def ssim_rows(
     similar[:] = light * both
 
 
-def _shown(values: np.ndarray) -> np.ndarray:
+def _shown(values: Array) -> Array:
     """Clamped to [0, 1]; NaN gives 0."""
     above = np.where(values > 0, values, f32(0))
-    shown: np.ndarray = np.where(above < 1, above, f32(1))
+    shown: Array = np.where(above < 1, above, f32(1))
     return shown
 
 
 def dssim_slopes(
-    launched: tuple[int, ...],
+    launched: Size,
     across: int,
     rows: int,
     columns: int,
@@ -61,10 +52,10 @@ def dssim_slopes(
     plane: int,
     wide: int,
     size: int,
-    taps: np.ndarray,
-    image: np.ndarray,
-    target: np.ndarray,
-    slopes: np.ndarray,
+    taps: Array,
+    image: Array,
+    target: Array,
+    slopes: Array,
 ) -> None:
     """What each window's SSIM gains by a change of its moments, named by the window's last pixel ([3, 3, wide])."""
     count, two = rows * stride, f32(2)
@@ -88,7 +79,7 @@ def dssim_slopes(
 
 
 def dssim_residual(
-    launched: tuple[int, ...],
+    launched: Size,
     across: int,
     rows: int,
     stride: int,
@@ -96,11 +87,11 @@ def dssim_residual(
     wide: int,
     factor: float,
     size: int,
-    taps: np.ndarray,
-    slopes: np.ndarray,
-    image: np.ndarray,
-    target: np.ndarray,
-    residual: np.ndarray,
+    taps: Array,
+    slopes: Array,
+    image: Array,
+    target: Array,
+    residual: Array,
 ) -> None:
     """Add the gradient of all windows' SSIM by `image`, times `factor`, to `residual`."""
     count = rows * stride

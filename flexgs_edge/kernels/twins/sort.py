@@ -5,20 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import CULLED
+from flexgs_edge.kernels.twins.arithmetic import Array, Size
 
 DIGITS = 1 << 11
 
 
-def block_of(count: int, blocks: int) -> np.ndarray:
+def block_of(count: int, blocks: int) -> Array:
     """[count], the block of each element: block b holds [count * b // blocks, count * (b + 1) // blocks)."""
     return ((np.arange(count, dtype=np.int64) + 1) * blocks - 1) // max(count, 1)
 
 
-def _count(cells: np.ndarray, counts: np.ndarray, blocks: int) -> None:
+def _count(cells: Array, counts: Array, blocks: int) -> None:
     counts[: DIGITS * blocks] = np.bincount(cells, minlength=DIGITS * blocks)
 
 
-def _scatter(cells: np.ndarray, offsets: np.ndarray, pairs: tuple[tuple[np.ndarray, np.ndarray], ...]) -> None:
+def _scatter(cells: Array, offsets: Array, pairs: tuple[tuple[Array, Array], ...]) -> None:
     order = np.argsort(cells, kind="stable")
     ordered = cells[order]
     at = offsets[ordered] + (np.arange(len(cells)) - np.searchsorted(ordered, ordered, side="left"))
@@ -27,9 +28,7 @@ def _scatter(cells: np.ndarray, offsets: np.ndarray, pairs: tuple[tuple[np.ndarr
     np.add.at(offsets, cells, np.uint32(1))
 
 
-def sort_count_first(
-    size: tuple[int, ...], count: int, keys: np.ndarray, bounds: np.ndarray, counts: np.ndarray, pairs: np.ndarray
-) -> None:
+def sort_count_first(size: Size, count: int, keys: Array, bounds: Array, counts: Array, pairs: Array) -> None:
     """Histogram of the first digit ([blocks, DIGITS]), and the bounds of each block's shown splats, summed."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
     block = block_of(count, blocks)[shown]
@@ -37,30 +36,21 @@ def sort_count_first(
     pairs[:] = np.bincount(block, weights=bounds[shown], minlength=blocks).astype(np.uint64)
 
 
-def sort_scatter_first(
-    size: tuple[int, ...], count: int, keys: np.ndarray, offsets: np.ndarray, keys_out: np.ndarray, ids_out: np.ndarray
-) -> None:
+def sort_scatter_first(size: Size, count: int, keys: Array, offsets: Array, keys_out: Array, ids_out: Array) -> None:
     """The first pass: keys and rows of the shown splats, sorted by the lowest digit."""
     shown, blocks = np.flatnonzero(keys[:count] != CULLED), size[0]
     cells = block_of(count, blocks)[shown] * DIGITS + keys[shown] % DIGITS
     _scatter(cells, offsets, ((keys[shown], keys_out), (shown.astype(np.uint32), ids_out)))
 
 
-def sort_count(size: tuple[int, ...], count: int, shift: int, keys: np.ndarray, counts: np.ndarray) -> None:
+def sort_count(size: Size, count: int, shift: int, keys: Array, counts: Array) -> None:
     """Histogram of the digit at `shift`."""
     digits = (keys[:count] >> np.uint32(shift)) % DIGITS
     _count(block_of(count, size[0]) * DIGITS + digits, counts, size[0])
 
 
 def sort_scatter(
-    size: tuple[int, ...],
-    count: int,
-    shift: int,
-    keys: np.ndarray,
-    ids: np.ndarray,
-    offsets: np.ndarray,
-    keys_out: np.ndarray,
-    ids_out: np.ndarray,
+    size: Size, count: int, shift: int, keys: Array, ids: Array, offsets: Array, keys_out: Array, ids_out: Array
 ) -> None:
     """One pass by the digit at `shift`."""
     digits = (keys[:count] >> np.uint32(shift)) % DIGITS
@@ -68,7 +58,7 @@ def sort_scatter(
     _scatter(cells, offsets, ((keys[:count], keys_out), (ids[:count], ids_out)))
 
 
-def exclusive_scan(size: tuple[int, ...], cells: int, blocks: int, values: np.ndarray) -> None:
+def exclusive_scan(size: Size, cells: int, blocks: int, values: Array) -> None:
     """Turn [blocks, cells] counts into offsets, cell by cell, in place; the total comes after them."""
     counts = values[: blocks * cells].reshape(blocks, cells)
     total = np.cumsum(counts.T.reshape(-1), dtype=np.uint32)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.constants import BLOCK, SPAN_SLACK, SPAN_SLACK_RELATIVE, TILE
-from flexgs_edge.kernels.twins.arithmetic import f32, fma
+from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fma
 from flexgs_edge.kernels.twins.sort import block_of
 
 EMPTY = (1 << 28, -1)  # First and last block column of a row that the splat does not touch
 _BANDS = np.arange(TILE // BLOCK, dtype=np.int32)
 
 
-def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def block_spans(records: Array, bands: Array, width: np.float32) -> tuple[Array, Array]:
     """First and last block column ([m, 4] i32) of splats ([m, 16]) over four block rows each ([m, 4]).
 
     The span of a row is empty if first > last.
@@ -33,7 +33,7 @@ def block_spans(records: np.ndarray, bands: np.ndarray, width: np.float32) -> tu
     return np.where(some, x0.astype(np.int32) >> 2, EMPTY[0]), np.where(some, x1.astype(np.int32) >> 2, EMPTY[1])
 
 
-def _expand(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _expand(first: Array, last: Array) -> tuple[Array, Array]:
     """(owner, value) for every value in [first, last] of each owner."""
     counts = np.maximum(last - first + 1, 0)
     owner = np.repeat(np.arange(len(counts)), counts)
@@ -41,22 +41,10 @@ def _expand(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return owner, first[owner] + within
 
 
-def list_pairs(
-    ids: np.ndarray, records: np.ndarray, width: np.float32, height: np.float32, inria_extent: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def list_pairs(ids: Array, records: Array, width: np.float32, height: np.float32) -> tuple[Array, Array, Array]:
     """(index into ids, tile, mask) of every pair, splat by splat in the order of `ids`."""
     splats = records[ids]
-    tiles_x, tiles_y = -(-int(width) // TILE), -(-int(height) // TILE)
-    if inria_extent:
-        spans = []
-        for centre, most in ((splats[:, 0], tiles_x), (splats[:, 1], tiles_y)):
-            radius = splats[:, 15]
-            first = np.fmax(np.floor((centre - radius) * f32(1 / TILE)), f32(0))
-            last = np.fmin(np.floor((centre + radius + f32(TILE - 1)) * f32(1 / TILE)) - f32(1), f32(most - 1))
-            spans.append((first.astype(np.int64), last.astype(np.int64)))
-        splat, ty = _expand(*spans[1])
-        row, tx = _expand(spans[0][0][splat], spans[0][1][splat])
-        return splat[row], ty[row] * tiles_x + tx, np.full(len(tx), 0xFFFF, np.uint32)
+    tiles_x = -(-int(width) // TILE)
     slack = fma(splats[:, 10], f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
     y0 = np.fmax(np.ceil(splats[:, 1] - splats[:, 10] - slack), f32(0)).astype(np.int64)
     y1 = np.fmin(np.floor(splats[:, 1] + splats[:, 10] + slack), height - f32(1)).astype(np.int64)
@@ -71,45 +59,40 @@ def list_pairs(
     return splat[row][keep], (ty[row] * tiles_x + tx)[keep], mask[keep]
 
 
-def tile_room(
-    size: tuple[int, ...], start: int, count: int, ids: np.ndarray, bounds: np.ndarray, room: np.ndarray
-) -> None:
+def tile_room(size: Size, start: int, count: int, ids: Array, bounds: Array, room: Array) -> None:
     """Most drafts of each block of the depth-ordered splats [start, start + count), into `room[0]`."""
     blocks = block_of(count, size[0])
     room[0] = np.bincount(blocks, weights=bounds[ids[start : start + count]], minlength=size[0]).astype(np.uint32)
 
 
-def _draft_places(room: np.ndarray) -> np.ndarray:
+def _draft_places(room: Array) -> Array:
     """[n] i64, the places of all drafts, block by block."""
     starts = np.cumsum(room[0], dtype=np.int64) - room[0]
     return _expand(starts, starts + room[1].astype(np.int64) - 1)[1]
 
 
 def tile_count(
-    size: tuple[int, ...],
+    size: Size,
     start: int,
     count: int,
     width: float,
     height: float,
-    inria_extent: int,
-    ids: np.ndarray,
-    records: np.ndarray,
-    room: np.ndarray,
-    drafts: np.ndarray,
-    counts: np.ndarray,
+    ids: Array,
+    records: Array,
+    room: Array,
+    drafts: Array,
+    counts: Array,
 ) -> None:
     """Drafts (row, tile, mask) of the splats [start, start + count), and their counts by tile and block of splats."""
     batch = ids[start : start + count]
-    splat, tile, mask = list_pairs(batch, records, f32(width), f32(height), inria_extent)
+    splat, tile, mask = list_pairs(batch, records, f32(width), f32(height))
     block = block_of(count, size[0])[splat]
     room[1] = np.bincount(block, minlength=size[0])
     drafts[_draft_places(room)] = np.stack([batch[splat], tile, mask], axis=1)
     counts[:-1] = np.bincount(block * (len(counts) // size[0]) + tile, minlength=len(counts) - 1)
 
 
-def tile_scatter(
-    size: tuple[int, ...], tiles: int, room: np.ndarray, drafts: np.ndarray, offsets: np.ndarray, pairs: np.ndarray
-) -> None:
+def tile_scatter(size: Size, tiles: int, room: Array, drafts: Array, offsets: Array, pairs: Array) -> None:
     """Write (row, mask) tile by tile in depth order; `offsets` become the ends of the cells."""
     row, tile, mask = drafts[_draft_places(room)].T
     order = np.argsort(tile, kind="stable")

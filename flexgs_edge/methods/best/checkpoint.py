@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import shutil
 import zlib
@@ -19,13 +18,12 @@ from flexgs_edge.memory.rows import blocks, read_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.effort import effort_of, finetune_steps
 from flexgs_edge.methods.best.poses import is_fine
+from flexgs_edge.progress import LOG
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
-
-LOG = logging.getLogger("flexgs_edge")
 
 DONE = "done"  # File that is written last, with the checksums of all others. A round without it was cut short.
 READ_BYTES = 1 << 20
@@ -144,8 +142,8 @@ def open_checkpoint(
     if steps and plan.interleaved:
         # The target says between which rounds a descent comes.
         words += f" {plan.interleaved!r} {steps} {run.target!r}"
-    assert options.near is not None and options.extent is not None
-    key = fingerprint(run.source, scored, words, options.near, options.extent, bool(options.antialiased), list(FIELD))
+    assert options.near is not None
+    key = fingerprint(run.source, scored, words, options.near, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
     if checkpoint.rounds:
         LOG.info(

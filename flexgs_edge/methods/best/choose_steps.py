@@ -24,9 +24,10 @@ from flexgs_edge.scene.rotations import tilted, turned
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.references import to_half
 
-GEOMETRY = ("position", "scale", "rotation", "opacity")
-VALUES = {"position": 3, "scale": 3, "rotation": 3, "opacity": 1}
-CHANGES = {"position": "means", "scale": "log_scales", "rotation": "quats", "opacity": "opacity_logits"}
+GEOMETRY = {
+    "position": ("means", 3), "scale": ("log_scales", 3), "rotation": ("quats", 3), "opacity": ("opacity_logits", 1),
+}  # fmt: skip
+"""Kinds of values: the field of each, and its coded values for a Gaussian."""
 SMALLEST_THREE = 1.051
 """Mean square error of a rotation over that of its three stored components. The fourth component follows from these, so
 its error adds up: the mean of 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
@@ -49,7 +50,7 @@ class Slopes:
     def step(self, kind: str, multiplier: float) -> float:
         """The step size of `kind` for a multiplier."""
         slope = max(self.per_row[kind], 1e-30)
-        return math.sqrt(GEOMETRY_REFITTED * multiplier * VALUES[kind] / (2 * math.log(2) * slope))
+        return math.sqrt(GEOMETRY_REFITTED * multiplier * GEOMETRY[kind][1] / (2 * math.log(2) * slope))
 
 
 def probe_slopes(
@@ -70,11 +71,11 @@ def probe_slopes(
     # Small enough that squared errors grow with squared steps; large enough to exceed the rounding of half precision.
     trial = {"position": size / 4, "scale": 0.1, "rotation": 0.03, "opacity": 0.2}
     per_row = {}
-    for kind in GEOMETRY:
-        field = CHANGES[kind]
+    fields = [field for field, _ in GEOMETRY.values()]
+    for kind, (field, _) in GEOMETRY.items():
         moved = {**planes, field: renderer.storage.empty(planes[field].shape, np.float32)}
-        for rows, found in read_ahead(count, *(planes[name] for name in CHANGES.values())):
-            part = dict(zip(CHANGES.values(), found, strict=True))
+        for rows, found in read_ahead(count, *(planes[name] for name in fields)):
+            part = dict(zip(fields, found, strict=True))
             put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             images = map(partial(renderer.render, scene), renderer.in_turn(scene, views))

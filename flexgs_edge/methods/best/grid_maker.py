@@ -22,7 +22,7 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.finetune import COURSE, LAST, Schedule, finetune, share_of_margin, structure_of
+from flexgs_edge.methods.best.refit.finetune import Schedule, finetune, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
@@ -90,10 +90,12 @@ class Descents:
         """Steps of the descent to a candidate for each scored pose."""
         return self.steps / self.poses
 
-    def schedule(self, share: float, fidelity: float | None, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+    def schedule(
+        self, share: float, fidelity: float | None, last: float = Schedule.last, multiplier: float = 0.0
+    ) -> Schedule:
         """A descent with `share` of a candidate's steps, from planes of this fidelity."""
         rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
-        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier, course=COURSE)
+        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier)
 
     def after(self, excess: float, left: float | None = None) -> float:
         """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
@@ -334,7 +336,7 @@ class GridMaker:
             costs = measure_costs(original.context, scene, original.cameras, sh_costs=False)
         return np.where(costs.weight2 > 0, costs.removal, np.inf)
 
-    def _schedule(self, share: float, planes: Planes, last: float = LAST, multiplier: float = 0.0) -> Schedule:
+    def _schedule(self, share: float, planes: Planes, last: float = Schedule.last, multiplier: float = 0.0) -> Schedule:
         """A descent from these planes with `share` of a candidate's steps."""
         fidelity = self.measure(planes, estimate=True).figure("fidelity")
         return self._descents.schedule(share, fidelity, last, multiplier)

@@ -14,12 +14,10 @@ from flexgs_edge.scene.curve import morton
 REACH = 0.04  # Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better.
 NEAR = 0.002  # How far below the limit, as a share of it, we are content
 TRIES = 4  # Most times that the file is coded on the way
-SHARE, DESCENDED_SHARE = 0.5, 0.33
-"""Share of the Gaussians to remove at first, for each unit of the log of what a quality allows; and behind a descent, where each
-matters more: docs/results/tuning.md#landing"""
 NEAR_QUALITY = 0.02  # How far below what it allows, as a share of it, we are content
-QUALITY_TRIES, DESCENDED_TRIES = 1, 6
-"""Most results that are made and measured on the way to a quality, and behind a descent; one more if none of them holds:
+REFITTED, DESCENDED = (0.5, 1), (0.33, 6)
+"""Share of the Gaussians to remove at first, for each unit of the log of what a quality allows, and most results that are made
+and measured on the way; one more if none of them holds. Behind a descent each Gaussian matters more:
 docs/results/tuning.md#landing"""
 
 
@@ -72,8 +70,8 @@ def land_on_quality(
     cheapest = np.argsort(removal, kind="stable")
     least, beyond, aim = 0, _beyond(removal), -NEAR_QUALITY / 2
     known, missed = np.asarray(excesses), None
-    tries = DESCENDED_TRIES if descended else QUALITY_TRIES
-    usual = (DESCENDED_SHARE if descended else SHARE) * grid.count
+    share, tries = DESCENDED if descended else REFITTED
+    usual = share * grid.count
     stride, slowest = (aim - known.max()) * usual, 1.0 / usual
     for number in range(min(tries + 1, most) if known.max() < -NEAR_QUALITY else 0):
         if number == tries and least:

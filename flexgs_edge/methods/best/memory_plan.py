@@ -6,7 +6,6 @@ scratch files. The output has the same bytes either way, but the search takes lo
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from flexgs_edge.methods.best.poses import is_fine
 from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
 from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row_bytes
+from flexgs_edge.progress import LOG
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
 from flexgs_edge.render.fit import (
     DEFAULT,
@@ -44,8 +44,6 @@ from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import format_size
-
-LOG = logging.getLogger("flexgs_edge")
 
 COST_BYTES = 16  # Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision
 BAND_BYTES = 20

@@ -6,11 +6,8 @@ search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluato
 
 from __future__ import annotations
 
-import logging
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +29,12 @@ from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
 from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
-from flexgs_edge.methods.best.poses import KnownErrors, ScoredPoses, scored_poses
+from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import Candidate, Maker, Product, RateResult, search
+from flexgs_edge.methods.best.search import Candidate, Maker, Product, search
 from flexgs_edge.methods.best.selection import Measure
+from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
@@ -51,8 +49,6 @@ from flexgs_edge.units import format_size
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
 from flexgs_edge.views.render_context import RenderContext
-
-LOG = logging.getLogger("flexgs_edge")
 
 See = Callable[[Sequence[int], int], bool]
 MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
@@ -206,92 +202,54 @@ def search_best(
     Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
     fit.
     """
-    with (
-        open_rounds(run, context, poses.cameras, checkpoint=checkpoint, known=poses.known) as rounds,
-        run.clock.stage("search"),
-    ):
-        further = 0
-
-        def see(views: Sequence[int], number: int) -> bool:
-            nonlocal further
-            beside = poses.beside([judge.cameras[view] for view in views], context.renderer, run.source)
-            seen = rounds.see(beside, number, poses.known)
-            if seen:
-                further += len(beside)
-                LOG.info("views that lose too much: %d; %d poses beside them are scored too", len(views), len(beside))
-            return seen
-
-        product, search = search_rounds(
-            make,
-            rounds,
-            run,
-            judge,
-            on_step=lambda step: LOG.info("%s", step_words(step, run.target)),
-            see=see if run.options.makes_poses else None,
-        )
-        scored = Scored(len(poses.cameras) + further, poses.made + further, rounds.unseen)
-        return product, replace(search, scored=scored)
-
-
-@contextmanager
-def open_rounds(
-    run: Run[CompressOptions],  # planned
-    context: RenderContext,  # draws the views
-    scored: Sequence[Camera],  # from `scored_poses`
-    checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run
-    known: KnownErrors | None = None,  # from `scored_poses`; descents look at poses by it
-) -> Iterator[PruneRounds]:
-    """Open the rounds of pruning for one search, or for several that share them, the weakest compression first."""
-    source, options, budget, storage = run.source, run.options, run.budget, context.renderer.storage
-    plan = MemoryPlan.of(run, context.renderer, scored)
-    budget.require("a search by measured costs", plan.held + plan.least)
-    budget.take("the scene and its search", plan.held)
-    try:
-        with References(storage.folder) as references:
-            with run.clock.stage("search"):
-                between = poses_between(scored) if plan.steps else ()
-                poses = [*scored, *between]
-                turns = known.slopes(poses) if known and plan.steps else None
-                rounds = PruneRounds(
-                    Original(context, source.origin, scored, references, between, run.progress, plan.steps, turns),
-                    source,
-                    refit=options.refit,
-                    unseen_share=options.unseen_share,
-                    checkpoint=checkpoint,
-                )
-            yield rounds
-    finally:
-        budget.give(plan.held)
-
-
-def search_rounds(
-    make: MakerOf[Product],
-    rounds: PruneRounds,
-    run: Run[CompressOptions],
-    judge: QualityEvaluator,
-    on_step: Callable[[Step], None] | None = None,
-    see: See | None = None,
-) -> tuple[Product, SearchResult]:
-    """Search as `search_best` does, from rounds that are open already."""
-    renderer, source = rounds.original.context.renderer, run.source
+    source, options, renderer, target = run.source, run.options, context.renderer, run.target
+    plan = MemoryPlan.of(run, renderer, poses.cameras)
+    run.budget.require("a search by measured costs", plan.held + plan.least)
+    run.budget.take("the scene and its search", plan.held)
+    further = 0
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
             quality = judge.estimate(kept_scene) if estimate else judge.compare(kept_scene, with_ssim=True)
             return measurement_of(quality)
 
-    def report(step: Candidate) -> None:
-        if on_step:
-            on_step(as_step(step, source.count))
+    def see(views: Sequence[int], number: int) -> bool:
+        nonlocal further
+        beside = poses.beside([judge.cameras[view] for view in views], renderer, source)
+        seen = rounds.see(beside, number, poses.known)
+        if seen:
+            further += len(beside)
+            LOG.info("views that lose too much: %d; %d poses beside them are scored too", len(views), len(beside))
+        return seen
 
-    found = search(make(rounds, measure, see), run.target, best_effort=run.options.takes_closest, on_step=report)
+    try:
+        with References(renderer.storage.folder) as references, run.clock.stage("search"):
+            between = poses_between(poses.cameras) if plan.steps else ()
+            turns = poses.known.slopes([*poses.cameras, *between]) if poses.known and plan.steps else None
+            rounds = PruneRounds(
+                Original(context, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns),
+                source,
+                refit=options.refit,
+                unseen_share=options.unseen_share,
+                checkpoint=checkpoint,
+            )
+            found = search(
+                make(rounds, measure, see if options.makes_poses else None),
+                target,
+                best_effort=options.takes_closest,
+                on_step=lambda step: LOG.info("%s", step_words(as_step(step, source.count), target)),
+            )
+    finally:
+        run.budget.give(plan.held)
     if found.chosen.left_out:
         LOG.warning(
             "%d Gaussians that no scored pose sees were left out: they lie so far away, or are so extreme, that all others "
             "would have to be coded more coarsely",
             found.chosen.left_out,
         )
-    return found.product, _as_search(found, source.count)
+    steps = tuple(as_step(step, source.count) for step in found.steps)
+    scored = Scored(len(poses.cameras) + further, poses.made + further, rounds.unseen)
+    return found.product, SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps, scored)
 
 
 def as_step(step: Candidate, count: int) -> Step:
@@ -305,8 +263,3 @@ def as_step(step: Candidate, count: int) -> Step:
         phase="multiplier",
         seconds=step.seconds,
     )
-
-
-def _as_search(found: RateResult[Any], count: int) -> SearchResult:
-    steps = tuple(as_step(step, count) for step in found.steps)
-    return SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps)

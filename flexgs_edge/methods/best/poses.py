@@ -25,11 +25,10 @@ STEP = 4  # Every fourth pixel in both directions is compared
 POWER = 4.8
 """Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
 does: docs/results/tuning.md#view_weights"""
-EVERY, BETWEEN = 8, 7
-"""Of `EVERY` given poses, the first and fifth get a nearer one, the third and seventh a farther one, and number `BETWEEN` one
-half way to its nearest neighbour: docs/results/tuning.md#margin. They come on top of the given poses; in place of them they
-would make files larger."""
-TIMES = {0: NEARER, 2: FARTHER, 4: NEARER, 6: FARTHER}
+HALF_WAY = 0.0
+TURN = (NEARER, None, FARTHER, None, NEARER, None, FARTHER, HALF_WAY)
+"""What each of eight given poses gets: a pose at so many times the distance, or one half way to its nearest neighbour:
+docs/results/tuning.md#margin. They come on top of the given poses; in place of them they would make files larger."""
 LEAST_GAIN = 0.2
 """A pose is needed if it adds at least this share of its own picture to what the scored ones see:
 docs/results/tuning.md#needed"""
@@ -38,8 +37,8 @@ NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half
 BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
 MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
 POINTS = 512  # Most points that tell what poses see
-FINE_DROP, FINE_FIDELITY, FINE_RATIO = 0.3, 42.0, 30.0
-"""Targets stricter than these (dB, dB, compression ratio) keep most SH of most Gaussians. Colours then have as many values
+FINE = {"max_drop": 0.3, "min_fidelity": 42.0, "min_ratio": 30.0}
+"""Targets stricter than these keep most SH of most Gaussians. Colours then have as many values
 as a part of the pixels, and a refit to that part would overfit. So such targets get every pixel of as many poses as the
 effort allows: docs/results/tuning.md#fine_drop"""
 COVERAGE_POSES = 32
@@ -107,13 +106,13 @@ def margin_of(
     `renderer`: with nothing loaded. `source`: the original. `poses`: poses that are scored, the most important first.
     `cameras`: all training poses.
     """
-    moved = [place for place in range(len(poses)) if place % EVERY in TIMES]
-    depths = dict(zip(moved, visible_depths(renderer, source, [poses[place] for place in moved]), strict=True))
+    turns = [(camera, TURN[place % len(TURN)]) for place, camera in enumerate(poses)]
+    depths = iter(visible_depths(renderer, source, [camera for camera, times in turns if times]))
     made = []
-    for place, camera in enumerate(poses):
-        if place in depths:
-            made.append(at_distance(camera, depths[place], TIMES[place % EVERY]))
-        elif place % EVERY == BETWEEN and len(cameras) > 1:
+    for camera, times in turns:
+        if times:
+            made.append(at_distance(camera, next(depths), times))
+        elif times == HALF_WAY and len(cameras) > 1:
             others = [other for other in cameras if other is not camera]
             away = [float(np.square(other.center - camera.center).sum()) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
@@ -311,7 +310,7 @@ def is_fine(options: CompressOptions, source: SceneSource) -> bool:
     ply_bytes = source.count * inria_dtype(source.sh_degree).itemsize
     if options.max_size is not None or options.min_ratio is not None:
         ratio = options.min_ratio if options.max_size is None else ply_bytes / options.max_size
-        return ratio is not None and ratio < FINE_RATIO
+        return ratio is not None and ratio < FINE["min_ratio"]
     if options.min_fidelity is not None:
-        return options.min_fidelity > FINE_FIDELITY
-    return options.max_drop is not None and options.max_drop < FINE_DROP
+        return options.min_fidelity > FINE["min_fidelity"]
+    return options.max_drop is not None and options.max_drop < FINE["max_drop"]

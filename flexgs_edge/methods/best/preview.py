@@ -40,8 +40,8 @@ second over 10 Mbit/s: docs/results/tuning.md#preview"""
 DRAWING = "near", "background", "extent", "antialiased"  # Settings that say how a file is drawn
 STAGES = 8, 4, 2
 """How many times as many Gaussians each stage leaves as the last one, which comes behind: docs/results/tuning.md#preview"""
-STEPS, LAST_STEPS, RATE = 150, 400, 2.0
-"""Steps of a descent, and of the last one; factor on the rates, since there is a long way to go."""
+STAGE, LAST_STAGE = Schedule(150, rate=2.0), Schedule(400, rate=2.0)
+"""The descents. Rates are higher than usual, since there is a long way to go."""
 KEPT = 0.5  # Share of the bits that stays in a stage before costs are measured again: docs/results/tuning.md#preview
 COARSE = 2.0  # Step sizes of the preview's grid, as multiples of those of the whole scene's
 POSES, POINTS = 128, 1 << 14  # Most poses, and about the most points that are looked at in each of them
@@ -70,13 +70,13 @@ def make_preview(
         del planes
         rows = 8 * most / bits.of_degree(0)
         for times in STAGES:
-            small = _stage(small, times * rows, original, Schedule(STEPS, rate=RATE))
+            small = _stage(small, times * rows, original, STAGE)
         coded = _Coded(small, grid, drawn, storage)
         for _ in range(TRIES):
             rows = coded.rows_in(most)
             if rows < 1:
                 break
-            made = _stage(small, rows, original, Schedule(LAST_STEPS, rate=RATE), grid.step_sizes)
+            made = _stage(small, rows, original, LAST_STAGE, grid.step_sizes)
             coded = _Coded(made, grid, drawn, storage)
             if len(coded.file) <= most:
                 return coded.file

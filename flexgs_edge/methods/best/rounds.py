@@ -121,10 +121,6 @@ class PruneRounds:
             costs = RemovalCosts.of(self._parts, storage)
         self._add(Snapshot(rows, start, costs), keep_views=True)
 
-    def scene_rows(self, places: np.ndarray) -> np.ndarray:
-        """[n] i64, rows of the scene, ascending, from places in `rows` (`Snapshot.rows`)."""
-        return np.sort(self.rows[places])
-
     def descend(self, share: float) -> Snapshot:
         """Do a round: keep `share` of the last snapshot, measure costs again, and refit colours by one step.
 

@@ -8,7 +8,6 @@ it that misses. The best candidate then loses Gaussians until it hardly holds.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,9 +17,7 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.promise import lost_views
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
-
-LOG = logging.getLogger("flexgs_edge")
-
+from flexgs_edge.progress import LOG
 
 NEAREST = 0.1
 """A new point keeps this share of the interval between its neighbours away from both, since curves are not quite

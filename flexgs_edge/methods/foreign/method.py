@@ -6,12 +6,17 @@ those of the file.
 
 from __future__ import annotations
 
-import logging
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from flexgs_edge.files import check_writable
 from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.io.exchange import read_foreign
+from flexgs_edge.grid.values import values_of
+from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.io.formats import Format
 from flexgs_edge.methods.best.allocation import BitModel, OneDegree, choose
 from flexgs_edge.methods.best.effort import effort_of
@@ -20,16 +25,15 @@ from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_byte
 from flexgs_edge.methods.best.method import MakerOf, See, choose_poses, search_best
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.selection import Measure
-from flexgs_edge.methods.foreign.file_maker import FileMaker, open_files, publish
+from flexgs_edge.progress import LOG
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
-from flexgs_edge.scene.fields import sh_rest_count
+from flexgs_edge.scene.fields import FIELD, sh_rest_count
+from flexgs_edge.scene.source import MemorySource, Planes
 from flexgs_edge.units import format_size
 from flexgs_edge.views.render_context import RenderContext
-
-LOG = logging.getLogger("flexgs_edge")
 
 
 def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
@@ -45,7 +49,9 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
         if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
         poses = choose_poses(run, context, judges.decide)
-        with open_files(run, format) as files:
+        beside = None if output is None else check_writable(output, options.force).parent
+        with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
+            files = Files(run, format, Path(folder))
             LOG.info("searching for %s", plan.target.describe())
             grid, search = search_best(file_maker(options, files), run, context, poses, judges.decide)
             judges.decided()
@@ -53,7 +59,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
             source = read_foreign(file)
             quality, size = judges.measure(source), file.stat().st_size
             if output is not None:
-                publish(file, output, options.force)
+                os.replace(file, check_writable(output, options.force))
                 LOG.info("wrote %s, %s", output, format_size(size))
         return MethodResult(
             size=size,
@@ -67,7 +73,46 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
         )
 
 
-def file_maker(options: CompressOptions, files: FileMaker) -> MakerOf[GridScene]:
+class Files:
+    """Writes one file of another program's format at a time; the last one stays until the next is asked for.
+
+    `folder`: for the file.
+    """
+
+    def __init__(self, run: Run[CompressOptions], format: Format, folder: Path) -> None:
+        # Positions of the whole scene are checked before the search, and not once more here.
+        self.format, self._writing = format, replace(run.options.writing, force_lossy=True)
+        self._path, self._budget = folder / f"scene{format.suffix}", run.budget
+        self._grid: GridScene | None = None
+
+    def of(self, grid: GridScene) -> Path:
+        """The file of a grid."""
+        if grid is not self._grid:
+            self._grid = None
+            size = self.format.memory * grid.count
+            self._budget.take(f"writing a {self.format.suffix}", size)
+            try:
+                source = MemorySource(values_of(grid), origin=grid.origin)
+                write_foreign(self._path, source, force=True, writing=self._writing)
+            finally:
+                self._budget.give(size)
+            self._grid = grid
+        return self._path
+
+    def size_of(self, grid: GridScene) -> int:
+        """Bytes of the file of a grid."""
+        return self.of(grid).stat().st_size
+
+    def decoded(self, grid: GridScene, origin: np.ndarray) -> Planes:
+        """What the file of a grid holds, as planes relative to `origin`."""
+        source = read_foreign(self.of(grid))
+        planes = source.read(slice(0, source.count), list(FIELD))
+        if np.any(source.origin != origin):
+            planes["means"] = (planes["means"] + (source.origin - origin)[:, None]).astype(np.float32)
+        return planes
+
+
+def file_maker(options: CompressOptions, files: Files) -> MakerOf[GridScene]:
     """Make makers of grids that are written as files of another program's format."""
 
     def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:

@@ -5,7 +5,6 @@ It takes less time than `best` and makes larger files.
 
 from __future__ import annotations
 
-import logging
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -19,9 +18,8 @@ from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
 from flexgs_edge.methods.paper.scores import score_cache, score_scene
 from flexgs_edge.methods.paper.search import adapt, measure_fixed
-from flexgs_edge.packed.bitspec import ALLOWED_DROP, PAPER, BitSpec, Sensitivity, search_bits
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
-from flexgs_edge.quality.psnr import error_for_drop
+from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.evaluators import Evaluators
@@ -29,41 +27,13 @@ from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import check_smaller
-from flexgs_edge.run.plan import EVERYTHING
-from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
 from flexgs_edge.views.render_context import RenderContext
 
-LOG = logging.getLogger("flexgs_edge")
-
-
-SENSITIVITY_VIEWS = 8  # Most training poses that sensitivity is measured on, evenly spread
 RANK_ROW_BYTES = 36
 """Bytes a Gaussian of orders, ranks, numbers of rows with SH, and rows of one choice. Scores, made before, take less."""
-
-
-def bits_by_sensitivity(
-    evaluator: SceneEvaluator, run: Run[CompressOptions], context: RenderContext
-) -> tuple[BitSpec, list[Sensitivity]]:
-    """Search for the bits with nothing pruned; returns them and the measured sensitivities."""
-    renderer, source, views, base_psnr = context.renderer, evaluator.source, run.seen, run.options.base_psnr
-    count = min(SENSITIVITY_VIEWS, len(views.train))
-    indices = [views.train[i * len(views.train) // count] for i in range(count)]
-    judge = QualityEvaluator(context, source, views, indices, with_photos=False, base_psnr=base_psnr)
-    with renderer.load(source) as original:
-        judge.prepare(original, run.progress)
-
-    def error(bits: BitSpec) -> float:
-        with evaluator.quantized(EVERYTHING, bits) as quantized, renderer.load_quantized(quantized) as scene:
-            return judge.compare(scene).deciding_error
-
-    kept, with_sh = evaluator.counts(EVERYTHING)
-    bits, found = search_bits(error, source.sh_degree, with_sh / kept, error_for_drop(ALLOWED_DROP, judge.base_psnr))
-    judge.close()
-    LOG.info("bits found by sensitivity: %s", bits)
-    return bits, found
 
 
 @dataclass(frozen=True)
@@ -90,13 +60,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
         ranked = Ranked(run.source, ranking.order, has_sh)
-        evaluator = SceneEvaluator(ranked, PAPER, groups, None if judges is None else judges.decide, run.budget)
-        sensitivity: list[Sensitivity] = []
-        if bits is None:
-            assert context is not None
-            with run.clock.stage("sensitivity"):
-                bits, sensitivity = bits_by_sensitivity(evaluator, run, context)
-        evaluator.bits = bits
+        evaluator = SceneEvaluator(ranked, bits, groups, None if judges is None else judges.decide, run.budget)
         with run.clock.stage("search"):
             search = _search(run, evaluator)
         if judges is not None:
@@ -116,7 +80,6 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
             trained=None if judges is None else judges.trained,
             bits=quantized.bits,
             groups={name: array.groups for name, array in quantized.arrays.items()},
-            sensitivity=tuple(sensitivity),
             scores_reused=ranking.reused,
         )
 
@@ -132,7 +95,7 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     return (
         RANK_ROW_BYTES * source.count
         + drawing_bytes(run)
-        + 3 * quantized_bytes(source.count, source.count, source.sh_degree, bits or PAPER, groups)
+        + 3 * quantized_bytes(source.count, source.count, source.sh_degree, bits, groups)
     )
 
 

@@ -107,8 +107,6 @@ class ScoreCache:
 def score_cache(path: str | Path, run: Run[Any], score: str) -> ScoreCache:
     """The cache at `path`, with the fingerprint of a run and the kind of its scores."""
     options = run.options
-    assert options.near is not None and options.extent is not None
+    assert options.near is not None
     cameras = run.seen.of(run.seen.train)
-    return ScoreCache(
-        path, fingerprint(run.source, cameras, score, options.near, options.extent, bool(options.antialiased))
-    )
+    return ScoreCache(path, fingerprint(run.source, cameras, score, options.near, bool(options.antialiased)))

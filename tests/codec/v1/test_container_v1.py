@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 import educational_decoder
 import flexgs_edge.codec.v1.header as layout
+from benchmarks.quantize import dequantized
 from fgs_damage import away
 from flexgs_edge.codec.header import canonical_json
 from flexgs_edge.codec.v1.container import read_header, verify, write_container
 from flexgs_edge.codec.v1.header import HEADER_OWN, Header, container_size, encode_header, header_block
-from flexgs_edge.codec.v1.packed_source import FgsSource, QuantizedSource
+from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.errors import InputError
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.packed.quantize import dequantize
@@ -54,7 +55,7 @@ def test_decoding_gives_the_quantizers_own_bits(tmp_path: Path, small_chunks: in
     assert source.settings == {"near": 0.2}
     assert (source.count, source.sh_count, source.sh_degree) == (count, quantized.sh_count, quantized.sh_degree)
     assert_same_codes(source.quantized(), quantized)
-    values, memory = whole(source), whole(QuantizedSource(quantized))
+    values, memory = whole(source), whole(dequantized(quantized))
     for name, array in quantized.arrays.items():
         expected = np.zeros((array.channels, count), np.float32)
         expected[:, : array.count] = dequantize(array, slice(None))
@@ -77,7 +78,7 @@ def test_any_rows_equal_those_of_the_whole(tmp_path: Path, small_chunks: int) ->
         np.array([5, 5, 6]),
         *lists,
     ]
-    for source in (FgsSource(path), QuantizedSource(quantized)):
+    for source in (FgsSource(path), dequantized(quantized)):
         reference = whole(source)
         for rows in parts:
             for name, plane in source.read(rows, NAMES).items():

@@ -11,15 +11,7 @@ import pytest
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.choose_steps import (
-    GEOMETRY,
-    VALUES,
-    Slopes,
-    choose_steps,
-    holdable,
-    probe_slopes,
-    reachable,
-)
+from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -48,7 +40,9 @@ def test_slopes_are_equal_at_the_chosen_steps() -> None:
     """With an error of slope s a row and squared step d^2 and bits of -n log2 d a row: the multiplier is dE / dbits."""
     multiplier = 1e-3
     steps = steps_at(multiplier)
-    rates = [2 * math.log(2) * SLOPES.per_row[kind] * getattr(steps, kind) ** 2 / VALUES[kind] for kind in GEOMETRY]
+    rates = [
+        2 * math.log(2) * SLOPES.per_row[kind] * getattr(steps, kind) ** 2 / GEOMETRY[kind][1] for kind in GEOMETRY
+    ]
     np.testing.assert_allclose(rates, rates[0], rtol=1e-5)
     # Colours: 3 w2 (Y e)^2 with e^2 = d^2 / 12 and Y the constant's; one value of luma for a row.
     for step, rows in ((steps.dc, WEIGHT2), (steps.sh[0], WEIGHT2[1:]), (steps.sh[1], WEIGHT2[2:])):

@@ -183,17 +183,12 @@ def wide_scene() -> MemorySource:
     return MemorySource({name: values[:, order] for name, values in planes.items()})
 
 
-@pytest.mark.parametrize(
-    ("form", "extent", "antialiased"),
-    [("w8", "exact", False), ("w8", "inria", False), ("w8", "exact", True), ("numpy", "inria", True)],
-)
-def test_views_read_the_chunks_that_they_see(
-    form: str, extent: str, antialiased: bool, compact: None, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("form", "antialiased"), [("w8", False), ("w8", True), ("numpy", True)])
+def test_views_read_the_chunks_that_they_see(form: str, antialiased: bool, compact: None, tmp_path: Path) -> None:
     source, views, counts = NotedSource(wide_scene()), cameras(), list[int]()
 
     def drawn(storage: ScratchStorage | None) -> list[np.ndarray]:
-        drawer = Renderer(open_form(form), large_budget(), extent=extent, antialiased=antialiased)
+        drawer = Renderer(open_form(form), large_budget(), antialiased=antialiased)
         if storage is not None:
             drawer.storage = storage
         found = []
@@ -224,29 +219,27 @@ def test_chunks_are_seen_where_any_of_their_splats_is() -> None:
     single = [ChunkBounds.of(planes["means"][:, [i]], planes["log_scales"][:, [i]]) for i in range(source.count)]
     parts = (np.concatenate([getattr(one, name) for one in single], axis=-1) for name in ("middle", "half", "extent"))
     bounds = ChunkBounds(*parts)
-    for inria in (False, True):
-        drawer = Renderer(open_form("numpy"), large_budget(), extent="inria" if inria else "exact")
-        with drawer.load(source) as scene:
-            for camera in [cameras()[0], *cameras()]:
-                drawer.render(scene, camera)
-                scene._planes.bounds.clear()  # from the second view on, no block is left out
-                if drawer.view_rows is not None:
-                    continue
-                assert drawer._buffers is not None
-                shown = np.asarray(drawer.backend.read(drawer._buffers.keys))[: source.count] != CULLED
-                record = camera_record(camera, source.origin, drawer.near)
-                seen = bounds.seen(record, inria)
-                assert not (shown & ~seen).any()
-                assert (~seen).sum() > 0.7 * (~shown).sum()
-        drawer.release()
+    drawer = Renderer(open_form("numpy"), large_budget())
+    with drawer.load(source) as scene:
+        for camera in [cameras()[0], *cameras()]:
+            drawer.render(scene, camera)
+            scene._planes.bounds.clear()  # from the second view on, no block is left out
+            if drawer.view_rows is not None:
+                continue
+            assert drawer._buffers is not None
+            shown = np.asarray(drawer.backend.read(drawer._buffers.keys))[: source.count] != CULLED
+            record = camera_record(camera, source.origin, drawer.near)
+            seen = bounds.seen(record)
+            assert not (shown & ~seen).any()
+            assert (~seen).sum() > 0.7 * (~shown).sum()
+    drawer.release()
 
 
 def test_numbers_beyond_all_bounds_are_seen() -> None:
     record = camera_record(cameras()[-1], np.zeros(3), 0.2)  # the one that sees nothing
     means, scales = np.zeros((3, 2), np.float32), np.zeros((3, 2), np.float32)
-    assert not ChunkBounds.of(means, scales).seen(record, False)
+    assert not ChunkBounds.of(means, scales).seen(record)
     scales[1, 1] = 1e4
     assert ChunkBounds.of(means, scales).extent == np.inf
-    for inria in (False, True):
-        assert not ChunkBounds.of(means, scales).seen(record, inria), "behind the camera, whatever the size"
-    assert ChunkBounds.of(np.full((3, 2), np.nan, np.float32), scales).seen(record, False)
+    assert not ChunkBounds.of(means, scales).seen(record), "behind the camera, whatever the size"
+    assert ChunkBounds.of(np.full((3, 2), np.nan, np.float32), scales).seen(record)

@@ -10,17 +10,7 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.storage import IN_MEMORY
-from flexgs_edge.methods.best.landing import (
-    DESCENDED_SHARE,
-    DESCENDED_TRIES,
-    NEAR_QUALITY,
-    QUALITY_TRIES,
-    REACH,
-    SHARE,
-    TRIES,
-    land,
-    land_on_quality,
-)
+from flexgs_edge.methods.best.landing import DESCENDED, NEAR_QUALITY, REACH, REFITTED, TRIES, land, land_on_quality
 from flexgs_edge.scene.fields import FIELD
 from synthetic import random_scene
 
@@ -102,8 +92,8 @@ def test_lands_just_below_a_quality(grid: GridScene, excess: float, power: float
 
     land_on_quality(grid, removal, [excess], attempt, IN_MEMORY, 9)
     best = max((found for _, found in seen if found <= 0.0), default=excess)
-    missed = all(found > 0.0 for _, found in seen[:QUALITY_TRIES])
-    assert len(seen) <= QUALITY_TRIES + missed and len({gone for gone, _ in seen}) == len(seen)
+    missed = all(found > 0.0 for _, found in seen[: REFITTED[1]])
+    assert len(seen) <= REFITTED[1] + missed and len({gone for gone, _ in seen}) == len(seen)
     assert best >= min(0.9 * excess, -NEAR_QUALITY) and (power != 1.0 or best >= -NEAR_QUALITY)
 
 
@@ -117,7 +107,7 @@ def test_each_bound_rises_at_its_own_pace(grid: GridScene) -> None:
         return [*seen[-1]]
 
     land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.1, -0.2], attempt, IN_MEMORY, 9, descended=True)
-    assert 2 <= len(seen) <= DESCENDED_TRIES and -NEAR_QUALITY <= seen[-1][1] <= 0.0
+    assert 2 <= len(seen) <= DESCENDED[1] and -NEAR_QUALITY <= seen[-1][1] <= 0.0
 
 
 @pytest.mark.parametrize("needless", [0.1, 0.2, 0.3])
@@ -133,7 +123,7 @@ def test_ever_more_go_while_nothing_is_lost(grid: GridScene, needless: float) ->
         return [excess]
 
     land_on_quality(grid, np.random.default_rng(1).random(COUNT), [-0.06], attempt, IN_MEMORY, 9, descended=True)
-    assert len(holds) + len(misses) <= DESCENDED_TRIES and max(holds) > 0.9 * needless
+    assert len(holds) + len(misses) <= DESCENDED[1] and max(holds) > 0.9 * needless
 
 
 def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
@@ -145,7 +135,7 @@ def test_fewer_go_behind_a_descent(grid: GridScene) -> None:
 
     for descended in (False, True):
         land_on_quality(grid, np.zeros(COUNT), [-0.11], attempt, IN_MEMORY, 9, descended)
-    assert asked == [round(0.1 * share * COUNT) for share in (SHARE, DESCENDED_SHARE)]
+    assert asked == [round(0.1 * share * COUNT) for share, _ in (REFITTED, DESCENDED)]
 
 
 def test_a_quality_that_is_met_is_left_alone(grid: GridScene) -> None:
@@ -160,9 +150,9 @@ def test_removals_that_gain_quality(grid: GridScene) -> None:
         return [-0.2]
 
     land_on_quality(grid, np.zeros(COUNT), [-0.1], attempt, IN_MEMORY, 9)
-    assert len(asked) == QUALITY_TRIES
+    assert len(asked) == REFITTED[1]
     land_on_quality(grid.take(np.arange(1)), np.zeros(1), [-0.1], attempt, IN_MEMORY, 9)
-    assert len(asked) == QUALITY_TRIES
+    assert len(asked) == REFITTED[1]
 
 
 def test_rows_that_must_stay(grid: GridScene) -> None:

@@ -242,7 +242,7 @@ def test_one_gaussian(project: Path, tmp_path: Path) -> None:
         ({"prune_rate": 0.2, "sh_rate": 0.1}, "--prune-rate belongs to --method paper"),
         ({"score": "meson"}, "--score belongs to --method paper"),
         ({"score_cache": "s.npz"}, "--score-cache belongs to --method paper"),
-        ({"bits": "auto"}, "--bits belongs to --method paper"),
+        ({"bits": "rtn8"}, "--bits belongs to --method paper"),
         ({"groups": 7}, "--groups belongs to --method paper, and this run is --method best: add --method paper"),
         ({"method": "paper", "unseen": "drop"}, "--unseen belongs to --method best"),
         ({"method": "paper", "refit": False}, r"--\[no-\]refit belongs to --method best"),

@@ -26,51 +26,32 @@ STRUCTURE, MARGIN_STRUCTURE, FULL_MARGIN = 0.02, 0.04, 0.3
 """Weights of 1 - SSIM in the loss, in units of a squared error, where the mean decides and where SSIM does; and the margin
 of SSIM from which the second one holds in full, the log of how much more of its bound SSIM has used than the mean:
 docs/results/tuning.md#led_structure"""
-LAST, LAST_HELD = 0.06, 0.03
-"""Rates at the end as a share of those at the beginning, while geometry moves and while it is held. They fall by the same factor
-at each step. With more, the views that come last decide too much: docs/results/tuning.md#last"""
-ON_GRID, HOLDING = 0.5, 0.75
-"""Share of the steps before views are drawn from values on their grids, and share before geometry is held there."""
+LAST_HELD = 0.03  # Rates at the end as a share of those at the beginning, while geometry is held
 HELD = ("means", "log_scales", "quats")
 """Fields that are held in the last steps. Codes of geometry that flip back and forth would move whole splats, and the
 last views would decide where they stay: docs/results/tuning.md#held"""
 
 
 @dataclass(frozen=True)
-class Course:
-    """Numbers of a descent that depend on how often it looks at every pose.
-
-    They are chosen in docs/results/tuning.md#together.
-    """
-
-    # Largest change of a position in a step, as a share of the cameras' extent. With more, positions shake.
-    means_rate: float
-    mean_views: float  # values on their grids are averaged over this many steps for each view
-    # Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only
-    # those that are shown: docs/results/tuning.md#bit_weight
-    bit_weight: float
-
-
-COURSE = Course(0.7e-4, 0.25, 5.0)
-"""Measured with 4 and 6 looks. The rate of positions is 0.4 times the reference program's."""
-
-
-@dataclass(frozen=True)
 class Schedule:
-    """Length and course of a descent.
-
-    `on_grid`, `holding`: share of the steps before values are put on their grids for drawing, and share before geometry
-    is held there.
-    """
+    """Length and course of a descent; chosen in docs/results/tuning.md#together, with 4 and 6 looks at each pose."""
 
     iterations: int  # how many views it looks at, one a step
     rate: float = 1.0  # factor on all rates
-    last: float = LAST  # rates at the end as a share of those at the beginning
-    on_grid: float = ON_GRID
-    holding: float = HOLDING
+    # Rates at the end as a share of those at the beginning, while geometry moves. They fall by the same factor at each
+    # step. With more, the views that come last decide too much: docs/results/tuning.md#last
+    last: float = 0.06
+    on_grid: float = 0.5  # share of the steps before views are drawn from values on their grids
+    holding: float = 0.75  # share before geometry is held there
     # Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
     multiplier: float = 0.0
-    course: Course = COURSE  # see there
+    # Largest change of a position in a step, as a share of the cameras' extent: 0.4 times the reference program's. With
+    # more, positions shake.
+    means_rate: float = 0.7e-4
+    mean_views: float = 0.25  # values on their grids are averaged over this many steps for each view
+    # Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only
+    # those that are shown: docs/results/tuning.md#bit_weight
+    bit_weight: float = 5.0
 
     def parts(self, grid: bool) -> tuple[range, range, range]:
         """Steps off the grid, on it, and on it with geometry held. Without a grid, all steps are off it."""
@@ -130,8 +111,8 @@ def finetune(
     the values ([width, n] f32 by field), not rounded to any grid, in the renderer's storage. Raises `BudgetError` when
     the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
     """
-    cameras, course = original.poses, schedule.course
-    rates = {**rates_for(cameras, course.means_rate), **(rates or {})}
+    cameras = original.poses
+    rates = {**rates_for(cameras, schedule.means_rate), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     renderer, storage = original.context.renderer, original.context.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.
@@ -139,7 +120,7 @@ def finetune(
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]
     with open_descent(renderer, ordered, degrees, original.origin, largest, structure) as descent:
         if step_sizes is not None and schedule.multiplier > 0 and len(degrees):
-            worth = course.bit_weight * schedule.multiplier / len(original.cameras)
+            worth = schedule.bit_weight * schedule.multiplier / len(original.cameras)
             descent.price(bit_prices(ordered, degrees, step_sizes, worth))
         order = schedule.order(len(cameras), original.turns)
         parts = schedule.parts(step_sizes is not None)
@@ -156,7 +137,9 @@ def finetune(
                 moving = {name: 0.0 if name in held else now * rate for name, rate in rates.items()}
                 # On the grid, a plain mean first, then one that forgets: single views then decide little.
                 share = (
-                    max(1.0 / (k - part.start + 1), 1.0 / max(course.mean_views * len(cameras), 1.0)) if place else 0.0
+                    max(1.0 / (k - part.start + 1), 1.0 / max(schedule.mean_views * len(cameras), 1.0))
+                    if place
+                    else 0.0
                 )
                 descent.step(cameras[order[k]], original.references[order[k]], moving, share)
         if len(parts[1]) or len(parts[2]):
