@@ -60,9 +60,8 @@ def test_numbers_of_numpy_and_paths_are_as_good() -> None:
 def test_images_may_come_from_a_generator() -> None:
     cameras = [make_camera(name=f"v{place}") for place in range(3)]
     photos = (np.zeros((30, 40, 3), np.uint8) for _ in cameras)
-    _, result = flexgs_edge.encode(
-        SCENE, cameras=cameras, images=photos, effort="fast", device="numpy", trust_views=True
-    )
+    words: dict[str, Any] = {"images": photos, "device": "numpy", "trust_views": True}
+    _, result = flexgs_edge.encode(SCENE, cameras=cameras, effort="fast", **words)
     assert result.quality is not None and result.quality.drop is not None
 
 
