@@ -13,6 +13,7 @@ GAIN_DIGITS = 4  # Decimals in comparisons of what a camera adds, as a share of 
 SAME_VIEW = 0.2
 """Two views of a point overlap if the cosine between their directions differs from 1 by less than this: up to 37
 degrees. A wider reach would leave out views that are needed: docs/results/tuning.md#same_view"""
+MOST_PAIRS = 1 << 21  # Most pairs of a camera and a point. With more cameras than fit, we look at fewer points.
 DIGITS = 8  # Decimals in comparisons of squared distances, so that rounding does not break ties
 BESIDE_EACH_OTHER = 2.0
 """Squared distance of two directions at a right angle. A camera that is farther turned looks the other way."""
@@ -30,17 +31,33 @@ def covering_order(cameras: Sequence[Camera], points: np.ndarray, near: float, c
     """
     if not cameras:
         return []
-    seen = np.array([in_picture(camera, points, near) for camera in cameras])
-    away = points[None] - np.array([camera.center for camera in cameras])[:, :, None]
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    known = np.zeros(seen.shape)
+    points = points[:, :: max(-(-len(cameras) * points.shape[1] // MOST_PAIRS), 1)]
+    known: dict[int, tuple[int, np.ndarray]] = {}  # How many chosen cameras were added up for some, and their sums
+    chosen: list[tuple[np.ndarray, np.ndarray]] = []
     order: list[int] = []
+
+    def lines(index: int) -> tuple[np.ndarray, np.ndarray]:
+        away = points - cameras[index].center[:, None]
+        away /= np.maximum(np.linalg.norm(away, axis=0, keepdims=True), np.finfo(np.float64).tiny)
+        return in_picture(cameras[index], points, near), away
+
+    def gain(index: int) -> float:
+        seen, away = lines(index)
+        number, sums = known.get(index, (0, np.zeros(points.shape[1])))
+        for other, beside in chosen[number:]:
+            sums += other * np.maximum(1.0 - (1.0 - (away * beside).sum(axis=0)) / SAME_VIEW, 0.0)
+        known[index] = len(chosen), sums
+        return float((np.where(seen, 1.0 / (1.0 + sums), 0.0).sum() / max(points.shape[1], 1)).round(GAIN_DIGITS))
+
+    # The gain of a camera only falls, so an older gain is an upper bound. Few cameras are looked at again for each one.
+    bounds = np.full(len(cameras), np.inf)
     while len(order) < min(count, len(cameras)):
-        gain = (np.where(seen, 1.0 / (1.0 + known), 0.0).sum(axis=1) / max(points.shape[1], 1)).round(GAIN_DIGITS)
-        gain[order] = -1.0
-        order.append(int(np.argmax(gain)))
-        cosine = (away * away[order[-1]]).sum(axis=1)
-        known += seen[order[-1]] * np.maximum(1.0 - (1.0 - cosine) / SAME_VIEW, 0.0)
+        fresh = np.zeros(len(cameras), bool)
+        while not fresh[best := int(np.argmax(bounds))]:
+            bounds[best], fresh[best] = gain(best), True
+        order.append(best)
+        chosen.append(lines(best))
+        bounds[best] = -1.0
     return order
 
 

@@ -135,24 +135,31 @@ def needed_poses(
 
     `deciding`: the views that decide. They are not scored, but poses half way to them are, if they are needed.
     """
+    if not scored:
+        return []
     points = points[:, :: -(-points.shape[1] // POINTS)] if points.shape[1] else points
-    there = [_seen(camera, points, near) for camera in scored]
-    found = [(camera, _seen(camera, points, near)) for camera in rest]
-    for camera, other in _pairs(given, deciding, there, points, near):
-        middle = between(camera, other)
-        found.append((middle, _seen(middle, points, near)))
-    known = [_known(seen, there) for _, seen in found]
+    there = _Others.of([_seen(camera, points, near) for camera in scored])
+    found = list(rest)
+    found += [between(camera, other) for camera, other in _pairs(given, deciding, there, points, near)]
+    known = [_known(_seen(camera, points, near), there) for camera in found]
+    bounds = np.array([_gain(_seen(camera, points, near), sums) for camera, sums in zip(found, known, strict=True)])
+    added: list[_Others] = []
+    upto = [0] * len(found)
     needed: list[Camera] = []
+    # What a pose adds only falls, so what it added before is an upper bound.
     while found and len(needed) < MOST_TIMES * len(given):
-        gains = [_gain(seen, already) for (_, seen), already in zip(found, known, strict=True)]
-        best = int(np.argmax(gains))
-        if gains[best] < LEAST_GAIN:
+        best = int(np.argmax(bounds))
+        if bounds[best] < LEAST_GAIN:
             break
-        camera, added = found.pop(best)
-        known.pop(best)
-        needed.append(camera)
-        for (_, seen), already in zip(found, known, strict=True):
-            already += _known(seen, [added])
+        seen = _seen(found[best], points, near)
+        if upto[best] == len(added):
+            needed.append(found[best])
+            added.append(_Others.of([seen]))
+            bounds[best] = -1.0
+            continue
+        for other in added[upto[best] :]:
+            known[best] += _known(seen, other)
+        upto[best], bounds[best] = len(added), _gain(seen, known[best])
     return needed
 
 
@@ -173,19 +180,33 @@ class _Seen:
     away: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Others:
+    """What several poses see: the arrays of `_Seen`, one row a pose."""
+
+    shown: np.ndarray
+    ahead: np.ndarray
+    away: np.ndarray
+
+    @staticmethod
+    def of(poses: Sequence[_Seen]) -> _Others:
+        return _Others(*(np.stack([getattr(pose, name) for pose in poses]) for name in ("shown", "ahead", "away")))
+
+    def without(self, place: int) -> _Others:
+        return _Others(*(np.delete(values, place, axis=0) for values in (self.shown, self.ahead, self.away)))
+
+
 def _seen(camera: Camera, points: np.ndarray, near: float) -> _Seen:
     ahead = points - camera.center[:, None]
     away = np.maximum(np.sqrt(np.square(ahead).sum(axis=0)), np.finfo(np.float64).tiny)
     return _Seen(in_picture(camera, points, near), ahead / away, away / camera.fx)
 
 
-def _known(seen: _Seen, others: Sequence[_Seen]) -> np.ndarray:
+def _known(seen: _Seen, others: _Others) -> np.ndarray:
     """[n] f64, how often other poses show each point from about the same direction."""
-    known = np.zeros(len(seen.shown))
-    for other in others:
-        alike = np.maximum(1.0 - (1.0 - (seen.ahead * other.ahead).sum(axis=0)) / SAME_VIEW, 0.0)
-        known += other.shown * alike * np.square(np.minimum(seen.away / other.away, 1.0))
-    return known
+    alike = np.maximum(1.0 - (1.0 - (seen.ahead * others.ahead).sum(axis=1)) / SAME_VIEW, 0.0)
+    found: np.ndarray = (others.shown * alike * np.square(np.minimum(seen.away / others.away, 1.0))).sum(axis=0)
+    return found
 
 
 def _gain(seen: _Seen, known: np.ndarray) -> float:
@@ -194,13 +215,13 @@ def _gain(seen: _Seen, known: np.ndarray) -> float:
 
 
 def _pairs(
-    given: Sequence[Camera], deciding: Sequence[Camera], there: Sequence[_Seen], points: np.ndarray, near: float
+    given: Sequence[Camera], deciding: Sequence[Camera], there: _Others, points: np.ndarray, near: float
 ) -> list[tuple[Camera, Camera]]:
     """Neighbours of which one at least would add enough itself: all others have enough poses round them."""
     pairs: dict[tuple[int, int], None] = {}
     for place, camera in enumerate(given):
-        own = there[place]
-        if _gain(own, _known(own, [*there[:place], *there[place + 1 :]])) >= LEAST_GAIN:
+        own = _Seen(there.shown[place], there.ahead[place], there.away[place])
+        if _gain(own, _known(own, there.without(place))) >= LEAST_GAIN:
             for other in nearest(camera, given, NEIGHBOURS):
                 pairs[min(place, other), max(place, other)] = None
     found = [(given[first], given[second]) for first, second in pairs]
