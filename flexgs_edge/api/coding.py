@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from flexgs_edge.api.words import CompressWords, StrPath
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands import compress as command
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import InputError, brief
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.inputs import checked_scene
@@ -78,12 +78,23 @@ def compress(
         named["cameras"] = os.fspath(cameras)
     elif cameras is not None:
         path = cameras.path if isinstance(cameras, Cameras) else None
-        given = replace(given, cameras=cameras, cameras_from=path or MEMORY)
+        given = replace(given, cameras=_listed("cameras", cameras, Camera), cameras_from=path or MEMORY)
     if isinstance(images, (str, os.PathLike)):
         named["images"] = os.fspath(images)
     elif images is not None:
-        given = replace(given, images=images)
+        given = replace(given, images=_listed("images", images, np.ndarray))
     return command.compress(opened, output, options, progress, given, **named, **words)
+
+
+def _listed(name: str, values: Iterable[Any], kind: type) -> list[Any]:
+    """The values of a sequence or a generator, all of one kind."""
+    if not isinstance(values, Iterable):
+        raise InputError(f"{name}={brief(values)}: expected a path or a sequence, found {type(values).__name__}")
+    listed = list(values)
+    for place, value in enumerate(listed):
+        if not isinstance(value, kind):
+            raise InputError(f"{name}[{place}]={brief(value)}: expected {kind.__name__}, found {type(value).__name__}")
+    return listed
 
 
 def encode(
@@ -127,6 +138,8 @@ def decode(file: bytes | bytearray | memoryview | StrPath) -> Scene:
     """
     if isinstance(file, (str, os.PathLike)):
         return Scene(replace(checked_scene(open_fgs(file), Path(file)), file_bytes=os.stat(file).st_size))
+    if not isinstance(file, (bytes, bytearray, memoryview)):
+        raise InputError(f"file={brief(file)}: expected bytes or a path, found {type(file).__name__}")
     # A container opens its file for each read, so bytes need a file as long as the source lives.
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from flexgs_edge.api.words import Arrays, Floats, Numbers, StrPath
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.commands.decompress import decompress
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import InputError, brief
 from flexgs_edge.io.ply import choose_origin, origin_rows
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.run.inputs import CheckedScene, checked_scene, companions_of, load_scene
@@ -68,6 +69,8 @@ class Scene:
         FormatError
             If the file does not follow its format.
         """
+        if not isinstance(path, (str, os.PathLike)):
+            raise InputError(f"path={brief(path)}: expected a path, found {type(path).__name__}")
         return cls(load_scene(path, drop_invalid, Reading.of(frame, lod, sh_degree)))
 
     @classmethod

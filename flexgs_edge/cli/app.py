@@ -17,7 +17,7 @@ import click
 
 from flexgs_edge._version import __version__
 from flexgs_edge.cli.lazy_group import LazyGroup
-from flexgs_edge.cli.talk import State
+from flexgs_edge.cli.talk import State, printable
 from flexgs_edge.errors import InputError
 from flexgs_edge.run.failure import failure_of
 
@@ -135,5 +135,5 @@ def _exit_code(error: BaseException) -> int:
 
 def _say(text: Any, code: int) -> int:
     logging.shutdown()
-    click.echo(f"flexgs-edge: {text}", err=True)
+    click.echo(printable(f"flexgs-edge: {text}"), err=True)
     return code

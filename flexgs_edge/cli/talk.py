@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,26 @@ import click
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.progress import Progress
+
+CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Characters that move the cursor, set colours or titles, or turn the direction of text: a file's strings may hold them."""
+
+
+def printable(text: str) -> str:
+    r"""The text with control characters but tabs and ends of lines as escapes.
+
+    >>> printable("a\x1b]0;title\x07b")
+    'a\\x1b]0;title\\x07b'
+    """
+    return CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
+
+
+class PrintableFormatter(logging.Formatter):
+    """Lines of a log without control characters."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        return printable(super().format(record))
 
 
 @dataclass
@@ -31,7 +52,7 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False, report
     """Set up the log on stderr, check before any work that the JSON file can be written, and return the progress bars."""
     log = logging.getLogger("flexgs_edge")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("flexgs-edge: %(message)s"))
+    handler.setFormatter(PrintableFormatter("flexgs-edge: %(message)s"))
     log.handlers = [handler]
     log.setLevel(logging.WARNING if quiet else logging.INFO)
     log.propagate = False
@@ -49,7 +70,7 @@ def start(quiet: bool, json_path: str | None = None, force: bool = False, report
 
 def emit(text: str, record: dict[str, Any] | list[Any], json_path: str | None, force: bool = False) -> None:
     """Print the summary to stdout, and write the JSON. With `--json -` the JSON goes to stdout and the summary to stderr."""
-    click.echo(text, nl=False, err=json_path == "-")
+    click.echo(printable(text), nl=False, err=json_path == "-")
     if json_path is None:
         return
     from flexgs_edge.report.as_json import json_text

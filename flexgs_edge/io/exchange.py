@@ -17,7 +17,7 @@ from flexgs_edge.io.compressed_ply import CHUNK
 from flexgs_edge.io.formats import FORMATS, Format, format_of, written_format
 from flexgs_edge.io.frames import in_frame
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
-from flexgs_edge.io.streamed_sog_writer import write_streamed_sog
+from flexgs_edge.io.streamed_sog_writer import STREAMED, write_streamed_sog
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
@@ -252,8 +252,9 @@ def wants_double(source: SceneSource, chunk_rows: int = 65536) -> tuple[bool, tu
 
 
 def offset_place(path: str | os.PathLike[str]) -> Path:
-    """The file beside `path` that holds the offset of a scene that was moved to zero."""
-    return Path(path).with_name(Path(path).name + ".offset.json")
+    """The file beside `path`, or beside the folder of a streamed scene, that holds the offset of one that was moved to zero."""
+    place = Path(path).parent if Path(path).name == STREAMED else Path(path)
+    return place.with_name(place.name + ".offset.json")
 
 
 def write_offset(path: str | os.PathLike[str], origin: np.ndarray, format: Format, force: bool) -> str:

@@ -49,6 +49,9 @@ LEAST_STEPS = 65535
 """With fewer steps of all loops together, no work-item of ours could do its part: such devices are refused."""
 
 
+_loaded_by: int | None = None  # the process that has loaded OpenCL runtimes
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """One OpenCL device: its limits, and whether it passed the self-test.
@@ -97,6 +100,13 @@ def list_devices(self_test: bool = True) -> list[DeviceInfo]:
     """
     import pyopencl as cl
 
+    global _loaded_by
+    if _loaded_by not in (None, os.getpid()):
+        raise DeviceError(
+            "this process was forked from one that uses OpenCL, whose threads it lacks: start it by another way "
+            "(multiprocessing.set_start_method('spawn')), or use device='numpy'"
+        )
+    _loaded_by = os.getpid()
     prepare_compiler_cache()
     try:
         platforms = cl.get_platforms()

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
 
 from flexgs_edge.cameras.camera import split_views
 from flexgs_edge.codec.v2.header import PREVIEW_MOST
 from flexgs_edge.constants import DEFAULT_BASE_PSNR, DEFAULT_HOLDOUT, MAX_VIEW_WIDTH
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import InputError, brief
 from flexgs_edge.goals.promise import (
     LEAST_SSIM,
     SSIM_PER_DB,
@@ -71,6 +76,33 @@ def check_method(method: str, given: Iterable[str]) -> None:
             )
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "None": ("None", lambda value: value is None),
+    "bool": ("True or False", lambda value: isinstance(value, (bool, np.bool_))),
+    "int": ("a whole number", lambda value: isinstance(value, Integral) and not isinstance(value, bool)),
+    "float": ("a number", _is_number),
+    "str": ("a string", lambda value: isinstance(value, (str, os.PathLike))),
+    "tuple[float, float, float]": (
+        "three numbers",
+        lambda value: isinstance(value, (tuple, list, np.ndarray)) and len(value) == 3 and all(map(_is_number, value)),
+    ),
+}  # What the type of a field stands for in words, and whether a value is of it
+
+
+def _check_kinds(options: ViewOptions) -> None:
+    """Raise `InputError` for a value of another type than that of its field: Python checks none."""
+    for field in fields(options):
+        kinds = [KINDS[kind] for kind in str(field.type).split(" | ")]
+        value = getattr(options, field.name)
+        if not any(fits(value) for _, fits in kinds):
+            expected = " or ".join(words for words, _ in kinds)
+            raise InputError(f"{field.name}={brief(value)}: expected {expected}, found {type(value).__name__}")
+
+
 @dataclass(frozen=True)
 class ViewOptions:
     """Where the views come from, and how they are drawn.
@@ -97,6 +129,7 @@ class ViewOptions:
     device: str | None = None
 
     def __post_init__(self) -> None:
+        _check_kinds(self)
         if self.resolution < 1:
             raise InputError(f"--resolution {self.resolution}: expected a width of at least 1 pixel")
         split_views(0, self.holdout)

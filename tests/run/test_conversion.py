@@ -22,6 +22,7 @@ from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.source import MemorySource, Planes
 
 UTM = np.array([482312.0, 5456784.0, 312.0])
+ECEF = np.array([4115235.0, 654321.0, 4812345.0])
 LOSSY = [".compressed.ply", ".splat", ".spz", ".sog"]
 
 
@@ -149,6 +150,27 @@ def test_scenes_far_from_zero_are_refused_or_moved(far: Path, suffix: str, tmp_p
     path.unlink()
     with pytest.raises(InputError, match=r"offset\.json: the file exists"):
         decompress(far, path, recenter=True)
+
+
+def test_earth_centred_scenes_and_streamed_ones(planes: Planes, tmp_path: Path) -> None:
+    write_ply(tmp_path / "ecef.ply", MemorySource(planes, 1, ECEF), double=True)
+    means = read_scene(tmp_path / "ecef.ply").read(slice(None), ["means"])["means"]
+    for name in ("a.glb", "a.ply"):
+        decompress(tmp_path / "ecef.ply", tmp_path / name, cameras="none")
+        found = read_scene(tmp_path / name)
+        away = (
+            found.read(slice(None), ["means"])["means"]
+            + (found.origin - read_scene(tmp_path / "ecef.ply").origin)[:, None]
+        )
+        assert np.abs(np.sort(away) - np.sort(means)).max() < 1e-5, name
+    for name in ("a.spz", "a.sog", "a.splat", "a.compressed.ply", f"s/{STREAMED}"):
+        with pytest.raises(InputError, match=r"holds these coordinates only to .*, and the smallest splat measures"):
+            decompress(tmp_path / "ecef.ply", tmp_path / name, cameras="none")
+    decompress(tmp_path / "ecef.ply", tmp_path / "s" / STREAMED, recenter=True, cameras="none")
+    assert (
+        json.loads((tmp_path / "s.offset.json").read_text())["offset"]
+        == read_scene(tmp_path / "ecef.ply").origin.tolist()
+    )
 
 
 def test_a_search_may_move_a_scene_to_zero(far: Path, sample_dir: Path, tmp_path: Path) -> None:
