@@ -1,4 +1,4 @@
-"""Checks that output keeps its bytes: compares digests of all files that 56 commands write for the bundled scene.
+"""Checks that output keeps its bytes: compares digests of all files that 50 commands write for the bundled scene.
 
 Every command runs in its own process and folder, by the command line alone. benchmarks/same_bytes.json keeps its exit
 code, its summary, its errors, and a digest of every file. For JSON it keeps every key, so that a lost key shows. Times,

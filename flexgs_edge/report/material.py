@@ -1,4 +1,4 @@
-"""Contents of a page besides the result: pictures, camera poses, and channels of the file."""
+"""Contents of a page besides the result: pictures, live scenes, and channels of the file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Shot:
     """
 
     view: int  # index into the views of the record's quality
-    camera: int  # index into the cameras of the rig
+    camera: int  # index into all cameras of the run
     rank: int
     of: int
     width: int
@@ -54,18 +54,6 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Rig:
-    """Camera poses in order of name, and some points of the scene."""
-
-    names: tuple[str, ...]  # names of the V cameras
-    centers: np.ndarray  # [V, 3] f64, positions in world coordinates
-    rotations: np.ndarray  # [V, 3, 3] f64, world to camera (x right, y down, z forward)
-    reach: np.ndarray  # [V, 2] f64, half the width and height of the visible area at distance 1
-    held_out: frozenset[int]  # Indices of the held-out cameras. All others are training cameras.
-    points: np.ndarray  # [P, 3] f64, positions of some Gaussians in world coordinates
-
-
-@dataclass(frozen=True)
 class Live:
     """Scenes that a page draws while it is looked at."""
 
@@ -81,7 +69,6 @@ class Material:
     """Contents of a page besides the result."""
 
     shots: tuple[Shot, ...] = ()  # pictures, worst view first
-    rig: Rig | None = None  # camera poses; `None` without cameras
     contents: dict[str, Any] | None = None  # JSON record of `info`; `None` for formats whose channels it does not know
     target: Target | None = None  # target that the search chart marks with a line
     live: Live | None = None  # live scenes

@@ -21,16 +21,14 @@ from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.material import FLIP_SCALE, Live, Material, Rig, Shot, error_map, ramp
+from flexgs_edge.report.material import FLIP_SCALE, Live, Material, Shot, error_map, ramp
 from flexgs_edge.report.pages import compress_page, evaluate_page
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
-from flexgs_edge.run.inputs import CheckedScene
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.scene.source import SceneSource
 
 MOST_SHOTS = 5
 """A report shows pictures of at most this many views: the worst, the median, the best, and one between each two."""
@@ -41,7 +39,6 @@ PIXEL_BYTES = 1
 JPEG_QUALITY = 95
 """High enough that pictures differ by our compression and not by JPEG: docs/results/tuning.md#jpeg_quality"""
 ERROR_QUALITY = 85
-MOST_POINTS = 1500  # The camera plans show the scene as at most this many of its Gaussians
 PAGE, RECORD = "index.html", "result.json"
 
 
@@ -122,21 +119,6 @@ def encode_map(errors: np.ndarray, size: tuple[int, int]) -> bytes:
     return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
 
 
-def rig_of(views: ViewSet, source: SceneSource) -> Rig:
-    """Collect the camera poses, and some Gaussians at evenly spaced rows. The same scene gives the same Gaussians."""
-    cameras = views.cameras
-    rows = np.unique(np.linspace(0, source.count - 1, min(source.count, MOST_POINTS)).astype(np.int64))
-    means = source.read(rows, ["means"])["means"]
-    return Rig(
-        names=tuple(camera.name for camera in cameras),
-        centers=np.stack([camera.center for camera in cameras]),
-        rotations=np.stack([camera.rotation for camera in cameras]),
-        reach=np.array([(camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)) for camera in cameras]),
-        held_out=frozenset(views.held_out),
-        points=means.T.astype(np.float64) + source.origin,
-    )
-
-
 class Reporter:
     """Collects the contents of a report during a run, and writes them at the end.
 
@@ -149,7 +131,6 @@ class Reporter:
             raise InputError("--report: expected a folder, found nothing")
         self.folder, self.force = Path(folder), force
         self._shots: tuple[Shot, ...] = ()
-        self._rig: Rig | None = None
         self._contents: dict[str, Any] | None = None
         self._live: Live | None = None
         self._check()
@@ -208,13 +189,9 @@ class Reporter:
         if self._shots:
             self._live = make(self._shots[0].camera)
 
-    def see_cameras(self, views: ViewSet, scene: CheckedScene) -> None:
-        """Keep the camera poses for the plans."""
-        self._rig = rig_of(views, scene.source)
-
     def write(self, result: CompressResult | EvaluateResult, target: Target | None = None) -> Path:
         """Write the page and the record: both, or neither if writing fails. Returns the path of the page."""
-        material = Material(self._shots, self._rig, self._contents, target, self._live)
+        material = Material(self._shots, self._contents, target, self._live)
         words = (
             compress_page(result, material) if isinstance(result, CompressResult) else evaluate_page(result, material)
         )

@@ -107,8 +107,6 @@ def open_run(
         views = find_views(options, companions, scene.source, photos, given, budget)
         if asked is None and views is not None:
             options, views = near_enough(options, views)
-        if reporter is not None and views is not None:
-            reporter.see_cameras(views, scene)
         unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
         found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:

@@ -19,21 +19,21 @@ def test_every_value_is_escaped_in_texts_and_attributes() -> None:
 
 
 def test_what_a_template_makes_is_taken_as_it_is_by_another() -> None:
-    page = render("study.html", title="<t>\udc80\x07", intro="", sections=())
+    page = render("study.html", name="rate", title="<t>\udc80\x07", intro="", facts=(), experiments=())
     assert "<h1>&lt;t&gt;\ufffd\ufffd</h1>" in page
     assert environment().from_string("{{ page }}").render(page=page) == page
 
 
 def test_a_value_that_nobody_gave_is_a_fault() -> None:
     with pytest.raises(UndefinedError, match="intro"):
-        render("study.html", title="", sections=())
+        render("study.html", title="", name="rate", facts=(), experiments=())
 
 
 def test_every_file_is_a_template_that_is_used() -> None:
     names = set(environment().list_templates())
     assert names == {path.name for path in TEMPLATES.iterdir()}
     asked = {name for path in TEMPLATES.iterdir() for name in re.findall(ASKED, path.read_text(encoding="utf-8"))}
-    rendered = {"compress.html", "report.html", "study.html", "step_chart.svg", "plans.html"}
+    rendered = {"compress.html", "report.html", "study.html", "step_chart.svg"}
     assert asked | rendered == names
     for name in names:
         environment().get_template(name)
