@@ -163,7 +163,7 @@ def decompress(
     if format is not None:
         options = ViewOptions(cameras=cameras, device=device, memory_limit=memory_limit)
         with clock.stage("compare"):
-            loss = conversion_loss(scene, output, options, ordered=not streamed, recentred=recenter)
+            loss = conversion_loss(scene, output, options, None if streamed else format, recentred=recenter)
         if loss.drop is not None and loss.drop > WARN_DROP:
             warnings += (
                 f"the pictures lose {loss.drop:.2f} dB, since {format.suffix} does not hold all of this scene; "

@@ -45,6 +45,7 @@ _SH_REACH = 4.0
 _SCALE_LIMIT = 20.0
 """Log-scales are clamped to this, as others do: one outlier would take the digits of its whole chunk."""
 _CHUNK_ROWS = 64 * CHUNK
+_CUT_CHUNKS = 64  # Boxes of more chunks are halved along their longest side: docs/results/tuning.md#cut_chunks
 
 
 class CompressedPlySource(DecodedSource):
@@ -215,6 +216,41 @@ def write_compressed_ply(file: BinaryIO, source: SceneSource, writing: Writing) 
         file.write(_vertices(values).tobytes())
     for rows in source.chunks(_CHUNK_ROWS) if source.sh_degree else ():
         file.write(_sh_codes(source.read(rows, ["sh_rest"])["sh_rest"]).T.tobytes())
+
+
+def chunk_order(means: np.ndarray) -> np.ndarray:
+    """[n] i64, an order of rows whose chunks take little room: a chunk rounds positions to shares of its range.
+
+    Boxes are cut in two until they are chunks, each where the squares of the ranges of all rows then add up to the least.
+    """
+    places = means.astype(np.float64) * np.array([[1.0], [2.0], [1.0]])  # y has a bit less
+    chunks, waiting = list[np.ndarray](), [np.argsort(places, axis=1, kind="stable")]
+    side = np.zeros(means.shape[1], bool)
+    while waiting:
+        sorted_rows = waiting.pop()
+        count = sorted_rows.shape[1]
+        if count <= CHUNK:
+            chunks.append(sorted_rows[0])
+            continue
+        starts = np.arange(0, count, CHUNK)
+        costs = np.full((3, len(starts) - 1), np.inf)
+        if len(starts) > _CUT_CHUNKS:
+            ends = [places[axis, sorted_rows[axis, [0, -1]]] for axis in range(3)]
+            costs[np.argmax([high - low for low, high in ends]), len(starts) // 2 - 1] = 0.0
+        else:
+            for axis, rows in enumerate(sorted_rows):
+                low, high = (each.reduceat(places[:, rows], starts, axis=1) for each in (np.minimum, np.maximum))
+                before = np.maximum.accumulate(high, axis=1) - np.minimum.accumulate(low, axis=1)
+                after = np.maximum.accumulate(high[:, ::-1], axis=1) - np.minimum.accumulate(low[:, ::-1], axis=1)
+                left, right = (np.square(ranges).sum(axis=0) for ranges in (before[:, :-1], after[:, -2::-1]))
+                costs[axis] = left * starts[1:] + right * (count - starts[1:])
+        axis, cut = divmod(int(np.argmin(costs)), costs.shape[1])
+        side[sorted_rows[axis]] = np.arange(count) < starts[1 + cut]
+        first = side[sorted_rows]
+        waiting += [sorted_rows[~first].reshape(3, -1), sorted_rows[first].reshape(3, -1)]
+    # Only the last chunk of a file may have fewer rows.
+    order: np.ndarray = np.concatenate(sorted(chunks, key=lambda rows: len(rows) != CHUNK))
+    return order
 
 
 def _bounded(source: SceneSource) -> Iterator[Planes]:

@@ -13,7 +13,7 @@ import numpy as np
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_folder, atomic_write, check_readable
 from flexgs_edge.io.codes import opacities
-from flexgs_edge.io.compressed_ply import CHUNK
+from flexgs_edge.io.compressed_ply import CHUNK, chunk_order
 from flexgs_edge.io.formats import FORMATS, Format, format_of, written_format
 from flexgs_edge.io.frames import in_frame
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
@@ -89,7 +89,7 @@ def write_foreign(
     check_positions(source, format, writing.force_lossy)
     world = _WorldSource(without_degrees(source, format.max_degree), format.keeps_origin)
     with atomic_write(path, force) as file:
-        format.write(file, in_frame(world.select(near_order(source)), format.frame), writing)
+        format.write(file, in_frame(world.select(near_order(source, format.chunked)), format.frame), writing)
     return _notes(source, format)
 
 
@@ -126,15 +126,15 @@ def _notes(source: SceneSource, format: Format) -> tuple[str, ...]:
     return notes
 
 
-def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
+def near_order(source: SceneSource, chunked: bool = False, chunk_rows: int = 65536) -> np.ndarray:
     """[N] i64, rows of `source` in the order that `write_foreign` writes them.
 
-    They lie along a Morton curve through the box of the scene, far ones last, by octaves of their distance. Formats
-    whose chunks share a range would else lose the digits of near rows to far ones beside them. One chunk has rows of both
-    kinds: its near ones are the faintest.
+    They lie along a Morton curve through the box of the scene, far ones last, by octaves of their distance. In formats
+    whose chunks share a range (`chunked`), near rows would lose their digits to far ones beside them, and chunks are as
+    small as can be. One chunk has rows of both kinds: its near ones are the faintest.
     """
     means = np.concatenate([source.read(rows, ["means"])["means"] for rows in source.chunks(chunk_rows)], axis=1)
-    order = near_rows(means)
+    order = chunk_order(means) if chunked else near_rows(means)
     away = means - np.median(means, axis=1, keepdims=True).astype(np.float64)
     distances = np.sqrt((away * away).sum(axis=0))
     limit = _FAR * float(np.median(distances))
@@ -146,6 +146,9 @@ def near_order(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     if mixed:
         octaves[near[np.argsort(_areas(source, near), kind="stable")[:mixed]]] = 1
         octaves[distances > limit] += 1
+    if chunked:
+        groups = np.flatnonzero(octaves == 0), np.flatnonzero(octaves)
+        return np.concatenate([rows[chunk_order(means[:, rows])] for rows in groups if rows.size])
     found: np.ndarray = order[np.argsort(octaves[order], kind="stable")]
     return found
 

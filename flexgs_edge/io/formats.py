@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame
 from flexgs_edge.io.reading import PLAIN, Reading, Writing
@@ -56,8 +57,10 @@ class Format:
     keeps_origin: bool = False  # It holds the origin of a scene far from zero apart, in float64
     max_degree: int = 3  # Highest SH degree
     fixed_rows: bool = False  # All rows take the same bytes: neither coarser values nor SH of zero save any
+    chunked: bool = False  # Neighbours in the file share ranges that round their positions
     row_bytes: float = 0.0
     sh_bytes: float = 0.0
+    most_colour: float = float("inf")  # Largest SH coefficient of degree 0 that it holds, on both sides of zero
     memory: int = 512  # Most bytes a Gaussian that writing and reading back hold
     marks_antialiased: bool = False  # Whether its files can say that a model is antialiased
     # A module that reading and writing load, and the extra of this package that brings it; or nothing
@@ -107,11 +110,11 @@ FORMATS: dict[str, Format] = {
         # 16 bytes, 45 bytes of SH, and 72 bytes for each chunk of 256 rows.
         Format(
             ".compressed.ply", f"{_IO}.compressed_ply:read_compressed_ply", f"{_IO}.compressed_ply:write_compressed_ply",
-            fixed_rows=True, row_bytes=61.3, sh_bytes=45.0,
+            fixed_rows=True, chunked=True, row_bytes=61.3, sh_bytes=45.0,
         ),
         Format(
             ".splat", f"{_IO}.splat:read_splat", f"{_IO}.splat:write_splat",
-            max_degree=0, fixed_rows=True, row_bytes=32.0, sh_bytes=0.0,
+            max_degree=0, fixed_rows=True, row_bytes=32.0, sh_bytes=0.0, most_colour=0.5 / SH_C0,
         ),
         Format(".ksplat", f"{_IO}.ksplat:read_ksplat"),
         Format(

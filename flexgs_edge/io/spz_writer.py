@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-from collections.abc import Callable, Iterator
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from typing import BinaryIO
 
 import numpy as np
@@ -28,12 +29,20 @@ from flexgs_edge.io.spz_layout import (
 )
 from flexgs_edge.scene.source import SceneSource
 
-SH_STEP = 8
-"""Step of the SH codes, in units of 1/128; the reference program takes 16 above degree 1, which causes nearly all of its
-loss. A smaller step costs more bytes than it is worth: docs/results/tuning.md#sh_step"""
+SH_STEP, FINE_SH_STEP = 8, 2
+"""Steps of the SH codes, in units of 1/128; the reference program takes 16 above degree 1, which causes nearly all of its
+loss. The finer one is for SH that lie on a grid: elsewhere it costs more bytes than it is worth.
+docs/results/tuning.md#sh_step"""
+_FEW_BYTES = 1.25  # Most that the bytes of SH may grow by a finer step
+_TRIED_ROWS = 1 << 14
 _LEAST_BITS = 12  # Bits behind the point that other writers always take
 _BITS_BELOW_SIZE = 5
 _CHUNK_ROWS = 1 << 14  # Fixed, since zstd's output may depend on the pieces that it gets
+_GZIP_HEADER = bytes([31, 139, 8, 0, 0, 0, 0, 0, 2, 255])
+"""Without a name and a time, so that the same scene gives the same bytes."""
+_LAST_BLOCK = b"\x03\x00"  # An empty block of deflate
+_STRATEGIES = (zlib.Z_DEFAULT_STRATEGY, zlib.Z_HUFFMAN_ONLY)
+"""Codes of opacities and scales repeat only by chance, which costs more than it saves."""
 _ZSTD_LEVEL = 19  # 7 % smaller than the reference program's 12, in the time that gzip takes for version 3
 
 
@@ -42,12 +51,13 @@ def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     flags = ANTIALIASED if writing.antialiased else 0
     header = SpzHeader(writing.spz_version, source.count, source.sh_degree, fraction_bits(source), flags)
     if header.version < FIRST_PLAIN:
-        # No name and no time in the gzip header, so that the same scene gives the same bytes.
-        with gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=file, mtime=0) as packed:
-            packed.write(header.packed)
-            for field in header.widths:
-                for codes in _array(source, header, field):
-                    packed.write(codes)
+        file.write(_GZIP_HEADER)
+        check, size = 0, 0
+        for field in (None, *header.widths):
+            packed, check, length = _deflated(_array(source, header, field) if field else [header.packed], check)
+            file.write(packed)
+            size += length
+        file.write(_LAST_BLOCK + struct.pack("<2I", check, size & 0xFFFFFFFF))
         return
     widths = header.widths
     place = PLAIN_HEADER.size
@@ -63,6 +73,19 @@ def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
         table += SIZES.pack(file.tell() - start, size)
     file.seek(place)
     file.write(table)
+
+
+def _deflated(pieces: Iterable[bytes], check: int) -> tuple[bytes, int, int]:
+    """Blocks of deflate that others may follow, by the strategy of zlib that suits best; checksum; and unpacked bytes."""
+    packers = [zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS, 9, strategy) for strategy in _STRATEGIES]
+    packed, size = [bytearray() for _ in packers], 0
+    for piece in pieces:
+        check, size = zlib.crc32(piece, check), size + len(piece)
+        for packer, found in zip(packers, packed, strict=True):
+            found += packer.compress(piece)
+    for packer, found in zip(packers, packed, strict=True):
+        found += packer.flush(zlib.Z_SYNC_FLUSH)
+    return bytes(min(packed, key=len)), check, size
 
 
 def fraction_bits(source: SceneSource) -> int:
@@ -88,9 +111,13 @@ def fraction_bits(source: SceneSource) -> int:
 
 def _array(source: SceneSource, header: SpzHeader, field: str) -> Iterator[bytes]:
     """The codes of one field, chunk by chunk."""
+    step = _sh_step(source) if field == "sh_rest" else 0
     for rows in source.chunks(_CHUNK_ROWS):
         values = source.read(rows, [field])[field]
-        codes = position_codes(values, header.fraction_bits) if field == "means" else _CODES[field](values)
+        if field == "means":
+            codes = position_codes(values, header.fraction_bits)
+        else:
+            codes = _sh_rows(values, step) if step else _CODES[field](values)
         yield codes.tobytes()
 
 
@@ -101,21 +128,28 @@ def position_codes(means: np.ndarray, bits: int) -> np.ndarray:
     return words.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].reshape(-1, 9)
 
 
-def sh_codes(values: np.ndarray) -> np.ndarray:
+def sh_codes(values: np.ndarray, step: int = SH_STEP) -> np.ndarray:
     """Bytes of SH coefficients, as int64; 128 stands for zero.
 
     >>> sh_codes(np.array([0.0, 0.07, -2.0, 5.0])).tolist()
     [128, 136, 0, 248]
     """
-    top = (255 - 128) // SH_STEP
-    steps = np.clip(np.rint(values.astype(np.float64) * (128 / SH_STEP)), -128 // SH_STEP, top)
-    return 128 + SH_STEP * steps.astype(np.int64)
+    steps = np.clip(np.rint(values.astype(np.float64) * (128 / step)), -128 // step, (255 - 128) // step)
+    return 128 + step * steps.astype(np.int64)
 
 
-def _sh_rows(planes: np.ndarray) -> np.ndarray:
+def _sh_rows(planes: np.ndarray, step: int) -> np.ndarray:
     """[n, 3 * K] u8: colour channels vary fastest in the file, and slowest in `planes`."""
-    codes = sh_codes(planes.reshape(3, len(planes) // 3, -1).transpose(2, 1, 0))
+    codes = sh_codes(planes.reshape(3, len(planes) // 3, -1).transpose(2, 1, 0), step)
     return codes.astype(np.uint8)
+
+
+def _sh_step(source: SceneSource) -> int:
+    """The step of SH codes that suits a scene, from what some of its rows take."""
+    rows = np.arange(0, source.count, -(-source.count // _TRIED_ROWS))
+    planes = source.read(rows, ["sh_rest"])["sh_rest"]
+    coarse, fine = (len(zlib.compress(_sh_rows(planes, step).tobytes(), 1)) for step in (SH_STEP, FINE_SH_STEP))
+    return FINE_SH_STEP if fine <= _FEW_BYTES * coarse else SH_STEP
 
 
 def _scale_codes(log_scales: np.ndarray) -> np.ndarray:
@@ -136,5 +170,4 @@ _CODES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "sh_dc": lambda planes: nearest((planes.T.astype(np.float64) * COLOUR_SCALE + 0.5) * 255),
     "log_scales": _scale_codes,
     "quats": lambda planes: smallest_three(planes).astype("<u4"),
-    "sh_rest": _sh_rows,
-}  # Codes of planes, row by row, for all fields but positions
+}  # Codes of planes, row by row, for all fields but positions and SH

@@ -32,7 +32,7 @@ from flexgs_edge.scene.source import SceneSource
 
 TYPE = "ParticleField3DGaussianSplat"
 COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
-_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+_SUFFIXES = (".usda", ".usdc", ".usdz", ".usd")
 _Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # From a stage whose up is z
 _REACH = 3.0  # Standard deviations of a Gaussian that its stated extent holds
 _ZIP_HEADER = 30  # Bytes of a file's header in a zip archive, without its name
@@ -55,7 +55,7 @@ def read_usd(path: Path, name: str, reading: Reading) -> GltfSource:
         try:
             stage = Usd.Stage.Open(os.fspath(path))
         except Tf.ErrorException as error:
-            why = str(error).strip().splitlines()[0].rpartition(" : ")[2]
+            why = str(error).replace(os.fspath(path), "it").strip().splitlines()[0].rpartition(" : ")[2]
             raise FormatError(f"{name}: usd-core cannot read it: {brief(why, 200)}; is it complete?") from error
         time = Usd.TimeCode.EarliestTime()
         transforms = UsdGeom.XformCache(time)
@@ -161,4 +161,4 @@ def _write(suffix: str, file: BinaryIO, source: SceneSource, writing: Writing) -
         archive.writestr(entry, data)
 
 
-write_usd, write_usda, write_usdc, write_usdz = (partial(_write, suffix) for suffix in _SUFFIXES)
+write_usda, write_usdc, write_usdz, write_usd = (partial(_write, suffix) for suffix in _SUFFIXES)

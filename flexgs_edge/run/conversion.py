@@ -11,6 +11,7 @@ from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.codes import opacities
 from flexgs_edge.io.exchange import MovedSource, near_order
+from flexgs_edge.io.formats import Format
 from flexgs_edge.report.file_results import ConversionLoss
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.inputs import CheckedScene, load_scene
@@ -28,7 +29,7 @@ def conversion_loss(
     scene: CheckedScene,
     output: str | os.PathLike[str],
     options: ViewOptions,
-    ordered: bool = True,
+    format: Format | None,
     recentred: bool = False,
 ) -> ConversionLoss:
     """Compare a written file with its scene, by the views and the photos that `evaluate` takes.
@@ -41,8 +42,8 @@ def conversion_loss(
         The file.
     options : ViewOptions
         Cameras, device and memory limit of the pictures.
-    ordered : bool
-        The file's rows have the order of `near_order`, so that values can be compared.
+    format : Format or None
+        What the file's rows are ordered for, so that values can be compared; `None`: they have another order.
     recentred : bool
         The file's scene was moved to zero.
 
@@ -54,7 +55,7 @@ def conversion_loss(
     written = load_scene(output)
     if recentred:
         written = replace(written, source=MovedSource(written.source, scene.source.origin))
-    values = _value_errors(scene.source, written.source) if ordered else {}
+    values = {} if format is None else _value_errors(scene.source, written.source, format.chunked)
     if options.cameras == NO_CAMERAS:
         return ConversionLoss(values, why=f"--cameras {NO_CAMERAS}")
     if options.device == "numpy" and options.cameras is None:
@@ -86,9 +87,9 @@ def conversion_loss(
     )
 
 
-def _value_errors(source: SceneSource, written: SceneSource) -> dict[str, tuple[float, float]]:
+def _value_errors(source: SceneSource, written: SceneSource, chunked: bool) -> dict[str, tuple[float, float]]:
     """Median and largest errors of some rows by value; the size of a splat is its largest deviation."""
-    order = near_order(source)
+    order = near_order(source, chunked)
     rows = np.arange(0, source.count, -(-source.count // _ROWS))
     fields = ["means", "log_scales", "opacity_logits", "sh_dc"]
     before, after = source.select(order[rows]).read(slice(0, rows.size), fields), written.read(rows, fields)

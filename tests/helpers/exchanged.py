@@ -40,7 +40,8 @@ def there_and_back(path: Path, source: SceneSource, writing: Writing = PLAIN) ->
     write_foreign(path, source, writing=writing)
     back = read_foreign(path)
     assert (back.count, back.sh_degree, back.name) == (source.count, source.sh_degree, str(path))
-    return planes_of(source.select(near_order(source))), planes_of(back)
+    order = near_order(source, path.name.endswith(".compressed.ply"))
+    return planes_of(source.select(order)), planes_of(back)
 
 
 def opacities(planes: Planes) -> np.ndarray:

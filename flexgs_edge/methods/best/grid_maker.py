@@ -56,6 +56,9 @@ INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 docs/results/tuning.md#interleaved"""
 FIXED_BITS = 2.0**-8
 """Share of the multiplier that chooses steps where coarser ones save no bytes: so fine that only the format rounds."""
+AGAIN_STEPS, AGAIN_RATE = 0.5, 0.25
+"""Steps and rates of the descent behind colours that were clipped, as shares of those before it:
+docs/results/tuning.md#clipped"""
 FINE_COLOUR = 2.0**-8
 """Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 PRICED, ABOVE = -0.035, 0.02
@@ -129,9 +132,10 @@ class GridMaker:
         chosen: Choose = choose,
         bits: BitModel | None = None,
         fixed_rows: bool = False,  # coarser steps save no bytes
+        most_colour: float = math.inf,  # constant colours are clipped to this, as SH coefficients
     ) -> None:
         self.rounds, self.size_of, self.measure = rounds, size_of, measure
-        self._fixed_rows = fixed_rows
+        self._fixed_rows, self._most_colour = fixed_rows, most_colour
         self._is_file = decoded is not None
         self._decoded = decoded or (lambda grid: values_of(grid, rounds.storage))
         self.effort, self.refit, self.steps, self.close = effort, refit, steps, effort.close
@@ -346,8 +350,20 @@ class GridMaker:
         return Descents(self.steps, len(self.rounds.original.cameras), self._guess.ssim_margin)
 
     def _finetune(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        weight = structure_of(self._guess.ssim_margin)
-        return finetune(kept.planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
+        """A descent; where colours are clipped after it, a second one lets the other values make up for that."""
+
+        def descend(planes: Planes, schedule: Schedule) -> Planes:
+            weight = structure_of(self._guess.ssim_margin)
+            moved = finetune(planes, kept.degrees, self.rounds.original, schedule, step_sizes, structure=weight)
+            if self._most_colour < math.inf:
+                np.clip(moved["sh_dc"], -self._most_colour, self._most_colour, out=moved["sh_dc"])
+            return moved
+
+        moved = descend(kept.planes, schedule)
+        if step_sizes is None or self._most_colour == math.inf:
+            return moved
+        steps = math.ceil(AGAIN_STEPS * schedule.iterations)
+        return descend(moved, replace(schedule, iterations=steps, rate=AGAIN_RATE * schedule.rate))
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

@@ -129,6 +129,7 @@ def file_maker(options: CompressOptions, files: Files) -> MakerOf[GridScene]:
             OneDegree() if files.format.fixed_rows else choose,
             bit_model(files.format),
             files.format.fixed_rows,
+            files.format.most_colour,
         )
         maker.selection.most = options.max_gaussians
         return maker
