@@ -60,16 +60,22 @@ def cells_of_one_layer(grid: GridScene) -> np.ndarray:
 
 def stops_at(monkeypatch: pytest.MonkeyPatch, most: int) -> threading.Event:
     """The server sends so many bytes; the others when the event is set."""
-    goes_on, write, sent = threading.Event(), server._Handler._write, []
+    goes_on, setup, sent = threading.Event(), server._Handler.setup, []
 
-    def waiting(self: Any, data: bytes) -> None:
-        sent.append(len(data))
-        if sum(sent) > most:
-            assert goes_on.wait(60)
-        write(self, data)
+    def counted(self: Any) -> None:
+        setup(self)
+        write = self.wfile.write
+
+        def waiting(data: bytes) -> int:
+            sent.append(len(data))
+            if sum(sent) > most:
+                assert goes_on.wait(60)
+            return int(write(data))
+
+        self.wfile.write = waiting
 
     monkeypatch.setattr(server, "_PIECE", 1000)
-    monkeypatch.setattr(server._Handler, "_write", waiting)
+    monkeypatch.setattr(server._Handler, "setup", counted)
     return goes_on
 
 
