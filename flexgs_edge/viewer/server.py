@@ -7,14 +7,14 @@ a name of their own.
 
 from __future__ import annotations
 
-import http.server
-import io
 import ipaddress
 import os
 import re
 import secrets
 import socket
 import socketserver
+import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -23,8 +23,12 @@ from typing import Any
 
 from flexgs_edge.errors import InputError
 
-IDLE_SECONDS = 30.0  # A connection on which nothing moves for so long is closed
+HEAD_MOST = 16384  # Most bytes of a request; browsers send less than one kilobyte
+HEAD_SECONDS = 10.0  # Time for a request to come
+SEND_SECONDS = 30.0  # Time for a piece of an answer to go
+CONNECTIONS_MOST = 64
 _PIECE = 1 << 16
+_REQUEST = re.compile(r"([A-Z]{1,16}) (\S{1,2048}) HTTP/1\.[01]")
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _NOTHING = "default-src 'none'; frame-ancestors 'none'"
 _HEADERS = {
@@ -106,12 +110,26 @@ class SceneServer:
 
 class _Server(socketserver.ThreadingTCPServer):
     allow_reuse_address = True
+    request_queue_size = CONNECTIONS_MOST
     daemon_threads = True
 
     def __init__(self, host: str, port: int, family: int, owner: SceneServer) -> None:
         self.address_family = family
         self.owner = owner
+        self.free = threading.BoundedSemaphore(CONNECTIONS_MOST)
         super().__init__((host, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self.free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no fault of ours."""
@@ -120,80 +138,112 @@ class _Server(socketserver.ThreadingTCPServer):
 class _Refused(Exception):
     def __init__(self, status: HTTPStatus, **headers: str) -> None:
         self.status = status
-        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
+        self.headers = headers
 
 
-class _Handler(http.server.BaseHTTPRequestHandler):
+class _Handler(socketserver.BaseRequestHandler):
     server: _Server
-    timeout = IDLE_SECONDS
-    protocol_version = "HTTP/1.1"
 
-    def parse_request(self) -> bool:
-        """Let in what asks for something under our own name, without a body."""
-        if not super().parse_request():
-            return False
-        hosts = self.headers.get_all("host", [])
-        if len(hosts) != 1 or not self.server.owner.knows(hosts[0].strip()):
-            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
-        elif self.command not in ("GET", "HEAD"):
-            self._refuse(_Refused(HTTPStatus.METHOD_NOT_ALLOWED, Allow="GET, HEAD"))
-        elif self.headers.get("content-length", "0") != "0" or "transfer-encoding" in self.headers:
-            self.send_error(HTTPStatus.BAD_REQUEST)
-        else:
-            return True
-        return False
-
-    def do_GET(self) -> None:
+    def handle(self) -> None:
         try:
             self._answer()
         except _Refused as refused:
-            self._refuse(refused)
-
-    do_HEAD = do_GET
+            more = {name.replace("_", "-"): value for name, value in refused.headers.items()}
+            text = f"{refused.status.value} {refused.status.phrase}\n".encode()
+            self._send(refused.status, {"Content-Type": "text/plain; charset=utf-8", **more}, text)
+            self._drain()
+        except OSError:
+            pass
 
     def _answer(self) -> None:
-        resource, asked = self.server.owner.find(self.path.partition("?")[0]), self.headers.get("range")
+        method, path, headers = self._request()
+        owner = self.server.owner
+        if not owner.knows(headers.get("host", "")):
+            raise _Refused(HTTPStatus.MISDIRECTED_REQUEST)
+        if method not in ("GET", "HEAD"):
+            raise _Refused(HTTPStatus.METHOD_NOT_ALLOWED, Allow="GET, HEAD")
+        if headers.get("content-length", "0") != "0" or "transfer-encoding" in headers:
+            raise _Refused(HTTPStatus.BAD_REQUEST)
+        resource = owner.find(path)
         if resource is None:
             raise _Refused(HTTPStatus.NOT_FOUND)
         content, about = resource.content, {"Content-Type": resource.kind, "Accept-Ranges": "bytes"}
-        if resource.packed is not None and asked is None and _takes_gzip(self.headers.get("accept-encoding", "")):
+        if resource.packed is not None and "range" not in headers and _takes_gzip(headers.get("accept-encoding", "")):
             content, about = resource.packed, {"Content-Type": resource.kind, "Content-Encoding": "gzip"}
         if resource.policy is not None:
             about["Content-Security-Policy"] = f"{resource.policy}; frame-ancestors 'none'"
         size = len(content) if isinstance(content, bytes) else os.stat(content).st_size
-        part = _part(asked, size)
+        part = _part(headers.get("range"), size)
         start, stop = part or (0, size)
         status = HTTPStatus.OK
         if part is not None:
             status = HTTPStatus.PARTIAL_CONTENT
             about["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
-        self._send(status, about, stop - start)
-        if self.command == "HEAD":
+        self._send(status, about, b"", stop - start)
+        if method == "HEAD":
             return
-        with io.BytesIO(content) if isinstance(content, bytes) else open(content, "rb") as file:
+        if isinstance(content, bytes):
+            self._write(content[start:stop])
+            return
+        with open(content, "rb") as file:
             file.seek(start)
             while start < stop and (piece := file.read(min(_PIECE, stop - start))):
-                self.wfile.write(piece)
+                self._write(piece)
                 start += len(piece)
 
-    def _send(self, status: HTTPStatus, about: Mapping[str, str], length: int) -> None:
-        self.send_response_only(status)
-        for name, value in {**_HEADERS, **about, "Content-Length": str(length)}.items():
-            self.send_header(name, value)
-        self.end_headers()
+    def _request(self) -> tuple[str, str, dict[str, str]]:
+        """Method, path without its query, and headers."""
+        lines = self._head().decode("latin-1").split("\r\n")
+        found = _REQUEST.fullmatch(lines[0])
+        if found is None:
+            raise _Refused(HTTPStatus.BAD_REQUEST)
+        headers: dict[str, str] = {}
+        for line in lines[1:]:
+            name, colon, value = line.partition(":")
+            name = name.lower()
+            if not colon or not name or name != name.strip() or (name in headers and name == "host"):
+                raise _Refused(HTTPStatus.BAD_REQUEST)
+            headers[name] = value.strip()
+        return found[1], found[2].partition("?")[0], headers
 
-    def _refuse(self, refused: _Refused) -> None:
-        text = f"{refused.status.value} {refused.status.phrase}\n".encode()
-        self._send(refused.status, {"Content-Type": "text/plain; charset=utf-8", **refused.headers}, len(text))
-        self.wfile.write(text)
+    def _head(self) -> bytes:
+        """The bytes of a request. They have to come within a time, however slowly each of them does."""
+        until = time.monotonic() + HEAD_SECONDS
+        data = b""
+        while (end := data.find(b"\r\n\r\n")) < 0:
+            if len(data) > HEAD_MOST:
+                raise _Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE)
+            self.request.settimeout(max(until - time.monotonic(), 0.001))
+            try:
+                piece = self.request.recv(4096)
+            except TimeoutError:
+                raise _Refused(HTTPStatus.REQUEST_TIMEOUT) from None
+            if not piece:
+                raise OSError("the client went away")
+            data += piece
+        return data[:end]
 
-    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer what the base class finds wrong with a request."""
-        self.request_version = self.protocol_version  # the base class would answer without headers
-        self._refuse(_Refused(HTTPStatus(code)))
+    def _send(self, status: HTTPStatus, about: Mapping[str, str], body: bytes, length: int | None = None) -> None:
+        headers = {**_HEADERS, **about, "Content-Length": str(len(body) if length is None else length)}
+        lines = [f"HTTP/1.1 {status.value} {status.phrase}", *(f"{name}: {value}" for name, value in headers.items())]
+        self._write("\r\n".join([*lines, "", ""]).encode("latin-1") + body)
 
-    def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not logged."""
+    def _write(self, data: bytes) -> None:
+        for at in range(0, len(data), _PIECE):
+            self.request.settimeout(SEND_SECONDS)
+            self.request.sendall(data[at : at + _PIECE])
+
+    def _drain(self) -> None:
+        """Read what a refused client still sends, for a moment: an early close would take our answer with it."""
+        try:
+            self.request.shutdown(socket.SHUT_WR)
+            until = time.monotonic() + 0.5
+            while (left := until - time.monotonic()) > 0:
+                self.request.settimeout(left)
+                if not self.request.recv(_PIECE):
+                    return
+        except OSError:
+            pass
 
 
 def _takes_gzip(accepted: str) -> bool:
