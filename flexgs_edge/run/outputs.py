@@ -44,9 +44,12 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     return Output(Path(output), format)
 
 
+LEAST_REFUSED = 1 << 16  # Of smaller inputs, headers alone may make a result larger: there a warning is enough
+
+
 def check_smaller(size: int, input_bytes: int | None, options: CompressOptions) -> None:
     """Raise `TargetError` if a result is larger than the file that came in. `--best-effort` writes it all the same."""
-    if input_bytes is not None and size > input_bytes and not options.best_effort:
+    if input_bytes is not None and size > input_bytes > LEAST_REFUSED and not options.best_effort:
         method = " leave --method paper out," if options.method == "paper" else ""
         raise TargetError(
             f"the result would have {size} bytes, and the input has {input_bytes}: nothing was written. Keep the input, or"

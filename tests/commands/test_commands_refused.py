@@ -70,7 +70,7 @@ def test_no_cameras_at_all(tmp_path: Path, done: tuple[Path, CompressResult], pr
         ({"background": (0.0, 2.0, 0.0)}, "--background"),
         ({"up": (0.0, 0.0, 0.0)}, "--up .*: expected three finite numbers, not all zero"),
         ({"up": (0.0, float("nan"), 1.0)}, "--up"),
-        ({"up": (0.0, 1.0)}, "--up"),
+        ({"up": (0.0, 1.0)}, "up=.*expected three numbers"),
         ({"holdout": 1}, "--holdout 1"),
         ({"resolution": 0}, "--resolution 0"),
     ],
@@ -128,8 +128,9 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
 
 @pytest.mark.parametrize("method", ["best", "paper"])
 def test_a_result_larger_than_its_input_is_not_written(
-    tmp_path: Path, done: tuple[Path, CompressResult], project: Path, method: str
+    tmp_path: Path, done: tuple[Path, CompressResult], project: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("flexgs_edge.run.outputs.LEAST_REFUSED", 1000)
     small = compress(project, tmp_path / "small.fgs", max_size=4000, **FAST).size
     words: dict[str, Any] = {**FAST, "method": method, "cameras": str(project / "cameras.json"), "images": "none"}
     finer = (

@@ -187,7 +187,7 @@ def test_cut_files_are_drawn_larger(tmp_path: Path) -> None:
     trim(path, cut, path.stat().st_size - 1)
     source = open_scene(cut)
     assert load_scene(path).drawn.count == 900 and load_scene(cut).drawn.count == source.count < 900
-    write_ply(grown, GrownSource(source, 900))
+    write_ply(grown, GrownSource(source, 900), double=True)
     poses = [dict(zip(("rotation", "translation"), look_from(seed), strict=True)) for seed in (1, 2)]
     cameras = [make_camera(64, 48, name=f"v{k}", **pose).moved(-source.origin) for k, pose in enumerate(poses)]
     words: dict[str, Any] = {"cameras": str(write_inria(tmp_path / "cameras.json", cameras))}

@@ -47,7 +47,7 @@ def fine_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "words",
     [
-        ["compress", "{file}", "--method", "paper", "-o", "{folder}/scene.fgs"],
+        ["compress", "{file}", "--method", "paper", "--best-effort", "-o", "{folder}/scene.fgs"],
         ["score", "{file}", "-o", "{folder}/scores.npz"],
         ["render", "{file}", "--views", "0,1,2", "-o", "{folder}/views"],
         ["evaluate", "{file}", "--against", str(SAMPLE)],
