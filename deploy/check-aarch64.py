@@ -75,7 +75,9 @@ def runtime_requirements() -> list[Requirement]:
     settings.read(ROOT / "setup.cfg")
     lists = [settings["options"]["install_requires"]]
     lists += [text for name, text in settings["options.extras_require"].items() if name not in LEFT_OUT]
-    return [Requirement(line) for text in lists for line in text.split("\n") if line.strip()]
+    lines = [line.strip() for text in lists for line in text.split("\n")]
+    found = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    return [each for each in found if each.marker is None or each.marker.evaluate({"platform_machine": "aarch64"})]
 
 
 def constraints(version: str) -> list[str]:

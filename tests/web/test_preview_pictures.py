@@ -60,22 +60,16 @@ def cells_of_one_layer(grid: GridScene) -> np.ndarray:
 
 def stops_at(monkeypatch: pytest.MonkeyPatch, most: int) -> threading.Event:
     """The server sends so many bytes; the others when the event is set."""
-    goes_on, setup, sent = threading.Event(), server._Handler.setup, []
+    goes_on, write, sent = threading.Event(), server._Handler._write, []
 
-    def counted(self: Any) -> None:
-        setup(self)
-        write = self.wfile.write
-
-        def waiting(data: bytes) -> int:
-            sent.append(len(data))
-            if sum(sent) > most:
-                assert goes_on.wait(60)
-            return int(write(data))
-
-        self.wfile.write = waiting
+    def waiting(self: Any, data: bytes) -> None:
+        sent.append(len(data))
+        if sum(sent) > most:
+            assert goes_on.wait(60)
+        write(self, data)
 
     monkeypatch.setattr(server, "_PIECE", 1000)
-    monkeypatch.setattr(server._Handler, "setup", counted)
+    monkeypatch.setattr(server._Handler, "_write", waiting)
     return goes_on
 
 
