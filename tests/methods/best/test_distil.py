@@ -278,6 +278,7 @@ def test_words_that_make_no_sense(words: dict[str, Any], message: str) -> None:
 
 
 def test_files_of_other_formats_are_fine_tuned_too(project: Path, tmp_path: Path) -> None:
+    # The size has room for all rows: between files of fewer, other rows would make the difference.
     words: dict[str, Any] = {"effort": "fast", "promise": "mean", "max_size": 12_000}
     plain, tuned = (compress(project / "point_cloud.ply", tmp_path / f"{n}.spz", distil=n, **words) for n in (0, 40))
     assert plain.training_fidelity is not None and tuned.training_fidelity is not None
