@@ -99,7 +99,7 @@ Several scenes:
 @option(REACH, "--max-size", type=value_types.SIZE, help="Best quality in at most this size, such as 8MB or 8MiB.")
 @option(REACH, "--min-ratio", metavar="R", type=float, help="Best quality in 1/R of the scene's bytes as a .ply.")
 @option(REACH, "--max-gaussians", metavar="N", type=int, help="Keep at most N Gaussians, whatever the target allows.")
-@option(REACH, "--best-effort", is_flag=True, help="If the target cannot be met, write the closest result.")
+@option(REACH, "--best-effort", is_flag=True, help="Write the closest result to a target, however large.")
 @shared_options.reading_options
 @shared_options.photos_options
 @shared_options.exposure_option

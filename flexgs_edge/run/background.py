@@ -11,7 +11,7 @@ Colour = tuple[float, float, float]
 
 ALIKE = 0.1
 """A colour is that of the background if no channel differs by more than this."""
-LEAST_SHARE = 0.1
+MOST_SHARE = 0.1
 """We take another background if more than this share of the matter has the colour of the one before."""
 BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0)}
 SAMPLE_ROWS = 1 << 16
@@ -35,7 +35,9 @@ def contrasting_background(source: SceneSource, usual: Colour) -> tuple[Colour, 
         return float(areas[alike].sum() / max(float(areas.sum()), 1e-300))
 
     hidden = share(usual)
-    if hidden <= LEAST_SHARE:
+    if hidden <= MOST_SHARE:
         return usual, None
-    name, found = min(BACKGROUNDS.items(), key=lambda item: share(item[1]) > LEAST_SHARE)
-    return found, f"compared before {name}: {100 * hidden:.0f} % of the matter has the colour of the background"
+    name = next((name for name, each in BACKGROUNDS.items() if share(each) <= MOST_SHARE), "green")
+    return BACKGROUNDS[
+        name
+    ], f"compared before {name}: {100 * hidden:.0f} % of the matter has the colour of the background"
