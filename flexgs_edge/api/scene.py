@@ -128,9 +128,8 @@ class Scene:
         origin = choose_origin(places[:, origin_rows(count)].T.astype(np.float64)) if count else np.zeros(3)
         planes["means"] = _plane(places.astype(np.float64) - origin[:, None] if origin.any() else places)
         source = MemorySource(planes, origin=origin)
-        source.doubles = (
-            bool(origin.any()) and places.dtype == np.float64
-        )  # near zero, NumPy's default type says nothing
+        # Near zero, NumPy's default type says nothing of what the values were.
+        source.doubles = bool(origin.any()) and places.dtype == np.float64
         checked = checked_scene(source, drop_invalid=drop_invalid)
         settings = {"antialiased": True} if antialiased else {}
         return cls(CheckedScene(None, checked.source, count, checked.source.sh_degree, settings))

@@ -30,11 +30,12 @@ from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.progress import LOG
 from flexgs_edge.report.file_results import DecompressResult
 from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.conversion import conversion_loss
 from flexgs_edge.run.decoding import ahead, decode_bytes, decoded_once, decoder
-from flexgs_edge.run.inputs import LOG, CheckedScene, ScenePlace, load_scene, scene_info
+from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
 from flexgs_edge.run.spent import run_info

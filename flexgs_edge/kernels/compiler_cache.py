@@ -5,7 +5,6 @@ PoCL offers no device where it cannot write that folder, and ends the process wh
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
 import struct
@@ -14,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-LOG = logging.getLogger("flexgs_edge")
+from flexgs_edge.progress import LOG
 
 VARIABLE = "POCL_CACHE_DIR"  # PoCL's own environment variable for the folder
 SHARED_MEMORY = "/dev/shm"

@@ -28,7 +28,7 @@ def fingerprint(
 
     `near`, `antialiased`: how views are drawn. Returns the digest in hexadecimal.
     """
-    digest = hashlib.sha256(f"{__version__} {kind} {near!r} exact {antialiased} {source.count} {len(cameras)}".encode())
+    digest = hashlib.sha256(f"{__version__} {kind} {near!r} {antialiased} {source.count} {len(cameras)}".encode())
     digest.update(source.origin.astype("<f8").tobytes())
     for camera in cameras:
         numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)

@@ -15,7 +15,7 @@ from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions, find_companions
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
-from flexgs_edge.progress import LOG as LOG
+from flexgs_edge.progress import LOG
 from flexgs_edge.report.run_info import SceneInfo
 from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
