@@ -9,7 +9,7 @@ The Python API has the words of the command line::
     arrays = flexgs_edge.decode("scene.fgs").arrays()
 
 Names are imported when they are first used, so that ``import flexgs_edge`` costs nothing. ``__init__.pyi`` lists them.
-`render`, `score` and `views` are rooms of the package, hence `render_views`, `score_gaussians` and `draw_sheet`.
+`render` and `views` are rooms of the package, hence `render_views` and `draw_sheet`.
 """
 
 from lazy_loader import attach_stub

@@ -19,7 +19,6 @@ from .commands.devices import devices as devices
 from .commands.evaluate import evaluate as evaluate
 from .commands.info import info as info
 from .commands.render import render_views as render_views
-from .commands.score import score_gaussians as score_gaussians
 from .commands.trim import trim as trim
 from .commands.verify import verify as verify
 from .commands.view import view as view
@@ -38,7 +37,6 @@ from .report.batch_result import BatchResult as BatchResult
 from .report.file_results import DecompressResult as DecompressResult
 from .report.file_results import DevicesResult as DevicesResult
 from .report.file_results import RenderResult as RenderResult
-from .report.file_results import ScoreResult as ScoreResult
 from .report.file_results import TrimResult as TrimResult
 from .report.file_results import VerifyResult as VerifyResult
 from .report.file_results import ViewResult as ViewResult

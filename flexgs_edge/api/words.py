@@ -83,7 +83,6 @@ class CompressWords(TypedDict, total=False):
     preview: int | None
     scratch: str | None
     resume: bool
-    cluster: str | None
     report: str | None
     dry_run: bool
     force: bool

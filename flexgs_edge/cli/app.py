@@ -31,7 +31,6 @@ COMMANDS = {
     "render": "Draw views of a scene as PNG files.",
     "views": "Draw all views of a scene on one sheet.",
     "evaluate": "Compare a scene with its original, view by view.",
-    "score": "Save the importance of every Gaussian, for --method paper.",
     "study": "Run experiments on your own scenes: tables and charts.",
     "devices": "List the OpenCL devices, and say which one is used.",
 }  # Subcommands and the first sentence of their help. They are repeated here so that `--help` imports no subcommand.

@@ -45,8 +45,6 @@ More examples:
       the paper's method, for two targets; the second run reuses the scores
   flexgs-edge compress point_cloud.ply -o c.fgs --method paper --prune-rate 0.3 --sh-rate 0.4
       fixed rates, no search
-  flexgs-edge compress point_cloud.ply -o d.fgs --cluster tcp://10.0.0.5:8786
-      draws views on other machines, too
   flexgs-edge compress big.ply -o big.fgs --memory-limit 1GiB --scratch /data/tmp --resume
       for a scene larger than memory; goes on after an interruption
   flexgs-edge compress scans/ garden/ -o small/ --format .spz
@@ -138,13 +136,6 @@ Several scenes:
     "--resume",
     is_flag=True,
     help="Save the progress in the scratch folder. After an interruption, the same command goes on from there. "
-    "The bytes stay the same.",
-)
-@option(
-    MACHINES,
-    "--cluster",
-    metavar="ADDRESS",
-    help="Draw views on the workers of a Dask cluster, such as tcp://HOST:8786. Needs pip install 'flexgs-edge[cluster]'. "
     "The bytes stay the same.",
 )
 @option(OUTPUT, "-o", "--output", metavar="OUT", help="File (.fgs, others: docs/formats.md), or a folder OUT/.")

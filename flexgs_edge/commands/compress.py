@@ -55,7 +55,7 @@ def compress(
             run.budget.require("the scene", 0)
         else:
             needed = partial(method.expected_bytes, run)
-            context = stack.enter_context(open_context(run, options.cluster, needed))
+            context = stack.enter_context(open_context(run, needed))
             run = check_views(run, context, options.trust_views)
         made = method.compress(run, context)
         result = _result(run, context, made)

@@ -124,15 +124,15 @@ class DeviceScene:
         held = (*self._resident, *self._pinned.values())
         return sum(array.nbytes for chunk in held for array in chunk.arrays)
 
-    def fingerprint(self, of_source: bool = False) -> bytes | None:
+    def fingerprint(self) -> bytes | None:
         """Digest of everything that views are drawn from.
 
-        It covers the chunks on the backend. With `of_source`, or if the scene is streamed, it covers the stored values.
+        It covers the chunks on the backend, and the stored values of a scene that is streamed.
 
         Returns `None` if nothing is on the backend and there is no source.
         """
         source = self.source
-        if source is not None and (of_source or self._streamed):
+        if source is not None and self._streamed:
             words = source.count, source.sh_count, source.sh_degree, source.origin.tolist(), self.antialiased
             digest = hashlib.sha256(repr(words).encode())
             for rows in source.chunks(self.fit.compact_rows):

@@ -142,31 +142,6 @@ class RenderResult:
 
 
 @dataclass(frozen=True)
-class ScoreResult:
-    """Result of `score`: the file of scores it wrote."""
-
-    scene: SceneInfo
-    views: ViewsInfo
-    output: str
-    score: str
-    scored_views: int
-    unseen: int
-    run: RunInfo
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
-        return record("score", self)
-
-    def summary(self) -> str:
-        """Return the text that the command prints."""
-        lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
-        unseen = f"; {self.unseen} Gaussians are in none of them" if self.unseen else ""
-        lines.append(line("scored", f"{self.score}, over {self.scored_views} training poses{unseen}"))
-        lines.append(line("wrote", self.output))
-        return text([*lines, *run_lines(self.run)])
-
-
-@dataclass(frozen=True)
 class VerifyResult:
     """Result of `verify`: the parts of a file and their verdicts."""
 

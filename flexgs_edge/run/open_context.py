@@ -1,4 +1,4 @@
-"""Open the context of a run: backend, renderer and, if asked for, a cluster."""
+"""Open the context of a run: backend and renderer."""
 
 from __future__ import annotations
 
@@ -12,21 +12,16 @@ from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.spent import run_info
-from flexgs_edge.views.cluster import Cluster
 from flexgs_edge.views.render_context import RenderContext
-from flexgs_edge.views.worker import Drawing
 
 
-def open_context(
-    run: Run[Any], cluster: str | None = None, needed: Callable[[], int] | None = None, compares: bool = True
-) -> RenderContext:
-    """Open the renderer, and the cluster if there is one. Close the context when done.
+def open_context(run: Run[Any], needed: Callable[[], int] | None = None, compares: bool = True) -> RenderContext:
+    """Open the renderer. Close the context when done.
 
     With `needed`, errors about the memory limit name one that is enough for the whole run: see `foresee`.
 
-    `run`: names the device, and pays for memory. `cluster`: address of a Dask scheduler. Each worker gets
-    the run's whole memory limit. Default: no cluster. Opening it is timed as the stages `device` and `cluster`.
-    Raises `DeviceError` if the named device does not exist or failed its self-test.
+    `run`: names the device, and pays for memory. Opening it is timed as the stage `device`. Raises `DeviceError` if the
+    named device does not exist or failed its self-test.
     """
     options: ViewOptions = run.options
     assert options.near is not None and options.background is not None
@@ -40,9 +35,6 @@ def open_context(
     if needed is not None:
         foresee(run, True, needed, compares)
     try:
-        if cluster is not None:
-            with run.clock.stage("cluster"):
-                context.cluster = Cluster(cluster, Drawing(options.device, options.memory_limit, *drawing))
         if run.reporter is not None and run.views is not None:
             run.reporter.reserve(run.budget, run.views)
     except BaseException:

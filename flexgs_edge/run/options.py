@@ -60,7 +60,6 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "preview": ("best", None),
     "scratch": ("best", None),
     "resume": ("best", False),
-    "cluster": ("best", None),
 }  # Options that only one `--method` knows: the method and the default of each
 
 
@@ -190,7 +189,6 @@ class CompressOptions(ViewOptions):
     preview: int | None = None
     scratch: str | None = None
     resume: bool = False
-    cluster: str | None = None
     report: str | None = None
     dry_run: bool = False
     force: bool = False

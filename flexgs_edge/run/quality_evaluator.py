@@ -99,8 +99,6 @@ class QualityEvaluator:
     def prepare(self, scene: DeviceScene, progress: Progress = SILENT) -> None:
         """Draw the references from `scene`, the loaded original, and measure them against the photos.
 
-        A cluster does not draw them: its images do not tell what the original covers.
-
         Raises `InputError` when no view sees any Gaussian.
         """
         self._original_error, self._original_ssim, self._coverage, self._gains = [], {}, [], []
@@ -200,8 +198,8 @@ class QualityEvaluator:
 
         `lpips`: also measure LPIPS with this network. It takes far longer than drawing the views. Default: no LPIPS.
         """
-        whole, elsewhere = self.reports and with_ssim and lpips is None, self.context.cluster is not None
-        drawn = scene.fingerprint(elsewhere) if whole else None
+        whole = self.reports and with_ssim and lpips is None
+        drawn = scene.fingerprint() if whole else None
         known = self._known.get(drawn) if drawn is not None else None
         if known is not None and (known.worst_flip or not flip):
             return known
@@ -225,7 +223,7 @@ class QualityEvaluator:
             made = self.made.quality(scene)
         quality = Quality(tuple(found), self.base_psnr, self.covered_decides, made)
         if whole and drawn is None:
-            drawn = scene.fingerprint(elsewhere)
+            drawn = scene.fingerprint()
         if drawn is not None:
             self._known[drawn] = quality
         return quality

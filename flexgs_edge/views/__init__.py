@@ -1,1 +1,1 @@
-"""Draw many views: reference renders, sums over views, and the workers of a cluster."""
+"""Draw many views: reference renders, sums over views."""

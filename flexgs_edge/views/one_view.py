@@ -1,9 +1,8 @@
-"""The sums of one view, split into parts that a worker can send and a scratch file can take."""
+"""The sums of one view, split into parts that a scratch file can take."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,18 +10,9 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.references import to_half
 
 SPOOL_ROWS = 1 << 16  # Rows of a view that are copied from the backend at a time
 Part = tuple[np.ndarray, np.ndarray]  # Rows of a scene ([m] u32, ascending) and their sums ([m, planes] i64)
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """Sums and picture of a view that a worker drew."""
-
-    parts: list[Part]
-    picture: np.ndarray | None  # [3, H, W] f16, in the layout of `References`: half the bytes to send
 
 
 def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:
@@ -44,11 +34,3 @@ def view_parts(renderer: Renderer, scene: DeviceScene, sums: Any) -> Iterator[Pa
         some = np.flatnonzero(got)
         rows = at + some if of_view is None else of_view[at + some]
         yield rows.astype(np.uint32), values.take(some, axis=0)
-
-
-def drawn_sums(
-    renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None, picture: bool
-) -> Drawn:
-    """Draw a view on a worker: its sums, and its picture if asked for."""
-    parts = list(view_parts(renderer, scene, view_sums(renderer, scene, kind, camera, target)))
-    return Drawn(parts, to_half(renderer.drawn_planes()) if picture else None)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
@@ -22,8 +21,7 @@ from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.one_view import Drawn, Part, view_parts, view_sums
-from flexgs_edge.views.render_context import RenderContext
+from flexgs_edge.views.one_view import Part, view_parts, view_sums
 
 
 class DenseSums:
@@ -148,38 +146,30 @@ Maker = Callable[[Chunk], ChunkSums]
 class ViewSums:
     """Sums over the views of a scene.
 
-    `context`: draws the views. `makers`: each makes one kind of sums for a chunk.
+    `renderer`: draws the views. `makers`: each makes one kind of sums for a chunk.
     """
 
-    def __init__(self, context: RenderContext, scene: DeviceScene, makers: Sequence[Maker]) -> None:
-        self._context, self._renderer, self._scene, self._makers = context, context.renderer, scene, makers
+    def __init__(self, renderer: Renderer, scene: DeviceScene, makers: Sequence[Maker]) -> None:
+        self._renderer, self._scene, self._makers = renderer, scene, makers
         scene.keep_chunks()
         self._held: dict[int, tuple[int, list[ChunkSums]]] = {}
         self._spool: Spool | None = None
-        self._dense: DenseSums | None = None
 
     def draw(
         self,
         kind: str,  # name of the method of `Renderer` that gives a view's sums
         cameras: Sequence[Camera],
         references: Callable[[int], np.ndarray] | None = None,
-        pictures: bool = False,  # whether the caller will use the yielded callables
     ) -> Iterator[Callable[[], np.ndarray]]:
-        """Draw views and add their sums, one view for each step of the iterator, in order, here or on the cluster.
+        """Draw views and add their sums, one view for each step of the iterator, in order.
 
         `references`: gives the target of a view by its place among `cameras`, if that method takes one. Yields gives
         the view's picture for `References.add`; valid until the next step.
         """
-        renderer, scene, cluster = self._renderer, self._scene, self._context.cluster
-        if cluster is None or scene.source is None:
-            for view, camera in enumerate(renderer.in_turn(scene, cameras)):
-                self.add_view(view_sums(renderer, scene, kind, camera, references and references(view)), camera)
-                yield renderer.drawn_planes
-            return
-        found = cluster.sums(scene.source, kind, cameras, references, pictures)
-        for camera, drawn in zip(cameras, found, strict=True):
-            self._add_drawn(drawn.parts, camera)
-            yield partial(_picture, drawn)
+        renderer, scene = self._renderer, self._scene
+        for view, camera in enumerate(renderer.in_turn(scene, cameras)):
+            self.add_view(view_sums(renderer, scene, kind, camera, references and references(view)), camera)
+            yield renderer.drawn_planes
 
     def add_view(self, sums: Any, camera: Camera) -> None:
         """Add the sums of the last view, from `camera`. The order of views is part of the result."""
@@ -198,31 +188,6 @@ class ViewSums:
             if chunk.base not in self._held:
                 self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
             yield chunk, self._held[chunk.base][1]
-
-    def _add_drawn(self, parts: Sequence[Part], camera: Camera) -> None:
-        """Add a view that a worker drew."""
-        renderer, scene = self._renderer, self._scene
-        if renderer.storage.spills:
-            self._add_parts(parts, camera)
-            return
-        if not parts:  # a compact view that shows nothing
-            return
-        renderer.aim(camera, scene.origin)
-        for chunk, held in self._chunks():
-            some = [slice(*np.searchsorted(rows, (chunk.base, chunk.base + chunk.count))) for rows, _ in parts]
-            shape = chunk.stride, *parts[0][1].shape[1:]
-            if self._dense is None or self._dense.shape != shape:
-                self._drop_dense()
-                self._dense = DenseSums(renderer.backend, shape)
-            inside = [(rows[at], values[at]) for (rows, values), at in zip(parts, some, strict=True)]
-            sums = self._dense.of(inside, chunk.base)
-            for kind in held:
-                kind.add(chunk, sums, self._dense.part(chunk))
-
-    def _drop_dense(self) -> None:
-        if self._dense is not None:
-            self._dense.release()
-            self._dense = None
 
     def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
         if self._spool is None:
@@ -265,12 +230,6 @@ class ViewSums:
             for part in parts:
                 part.release()
         self._held = {}
-        self._drop_dense()
         if self._spool is not None:
             self._spool.close()
             self._spool = None
-
-
-def _picture(drawn: Drawn) -> np.ndarray:
-    assert drawn.picture is not None
-    return drawn.picture

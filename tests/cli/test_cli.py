@@ -88,14 +88,13 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
     assert tuple(given["effort"].type.choices) == EFFORT_WORDS
     assert EFFORT_WORDS == tuple(EFFORTS) == tuple(REFINE_STEPS)
     assert tuple(given["method"].type.choices) == METHODS and tuple(given["select"].type.choices) == SELECTS
-    score = importlib.import_module("flexgs_edge.cli.score").command
-    assert tuple({p.name: p for p in score.params}["score"].type.choices) == SCORES
+    assert tuple(given["score"].type.choices) == SCORES
     defaults = CompressOptions()
     for name in fields:
         default = given[name].default
         plain = None if default in (None, False) or "UNSET" in str(default).upper() else default
         assert plain == (getattr(defaults, name) or None), name
-    for name in ("render", "evaluate", "score"):
+    for name in ("render", "evaluate"):
         found = {p.name for p in importlib.import_module(f"flexgs_edge.cli.{name}").command.params}
         assert set(ViewOptions.__dataclass_fields__) - found <= {"images", "holdout", "exposure"}
 
@@ -139,7 +138,6 @@ def test_a_whole_way_in_processes_of_its_own(project: Path, tmp_path: Path) -> N
             "--device",
             "numpy",
         ),
-        ("score", project, "-o", tmp_path / "s.npz", "--device", "numpy"),
     ]
     (project / "point_cloud" / "iteration_7").mkdir(parents=True, exist_ok=True)
     (project / "point_cloud" / "iteration_7" / "point_cloud.ply").write_bytes(
@@ -182,14 +180,13 @@ def test_text_and_json_of_info_agree(packed: Path, capsys: pytest.CaptureFixture
 def test_nothing_is_overwritten_without_force(
     project: Path, packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("a.fgs", "a.ply", "s.npz", "a.json", "v00.png"):
+    for name in ("a.fgs", "a.ply", "a.json", "v00.png"):
         (tmp_path / name).write_text("precious")
     scene, poses = project / "point_cloud.ply", project / "cameras.json"
     cases = [
         ("compress", scene, "-o", tmp_path / "a.fgs", *PAPER),
         ("compress", scene, "-o", tmp_path / "n.fgs", "--json", tmp_path / "a.json", *PAPER),
         ("decompress", packed, "-o", tmp_path / "a.ply"),
-        ("score", scene, "-o", tmp_path / "s.npz"),
         ("render", packed, "-o", tmp_path, "--cameras", poses, "--views", "0"),
         ("info", packed, "--json", tmp_path / "a.json"),
         ("devices", "--json", tmp_path / "a.json"),
@@ -197,7 +194,7 @@ def test_nothing_is_overwritten_without_force(
     for case in cases:
         code, out, err = run(*case, capsys=capsys)
         assert code == 2 and out == "" and "exists" in err and "-f" in err, case
-    assert all((tmp_path / name).read_text() == "precious" for name in ("a.fgs", "a.ply", "s.npz", "a.json", "v00.png"))
+    assert all((tmp_path / name).read_text() == "precious" for name in ("a.fgs", "a.ply", "a.json", "v00.png"))
     code, _, _ = run("decompress", packed, "-o", tmp_path / "a.ply", "-f", capsys=capsys)
     assert code == 0 and (tmp_path / "a.ply").stat().st_size > 1000
 
@@ -224,7 +221,7 @@ def test_nothing_is_overwritten_without_force(
         (["verify", "none.fgs"], "none.fgs"),
         (["render", "none.ply", "-o", "d", "--views", "3-4"], "START:STOP:STEP"),
         (["evaluate", "none.ply"], "Missing option"),
-        (["score", "none.ply", "-o", "s.npz", "--score", "magic"], "magic"),
+        (["compress", "none.ply", "-o", "s.fgs", "--score", "magic"], "magic"),
     ],
 )
 def test_misuse_ends_with_2_and_no_traceback(

@@ -80,14 +80,11 @@ def test_render(project: Path, tmp_path: Path) -> None:
         assert (pictures["plain"] != pictures[name]).mean() > 0.1
 
 
-def test_evaluate_and_score(project: Path, tmp_path: Path) -> None:
-    """Both name the frame of the scene that the cameras belong to."""
+def test_evaluate(project: Path, tmp_path: Path) -> None:
+    """It names the frame of the scene that the cameras belong to."""
     words = ("--holdout", "0", "--frame", "RUB", "--json", tmp_path / "a.json", "-f")
     assert run("evaluate", project / "point_cloud.ply", "--against", project / "rub.ply", *words) == 0
     assert record(tmp_path / "a.json")["quality"]["fidelity"] is None  # type: ignore[index]
-    assert run("score", project / "rub.ply", "-o", tmp_path / "turned.npz", *words) == 0
-    assert run("score", project / "point_cloud.ply", "-o", tmp_path / "plain.npz", *words[:2]) == 0
-    np.testing.assert_array_equal(np.load(tmp_path / "turned.npz")["scores"], np.load(tmp_path / "plain.npz")["scores"])
 
 
 def test_compress(project: Path, tmp_path: Path) -> None:
@@ -121,7 +118,6 @@ def test_words_that_mean_nothing(
         ("compress", scene, "-o", f"{out}.fgs", *COMPRESS),
         ("decompress", scene, "-o", f"{out}.ply"),
         ("render", scene, "-o", out),
-        ("score", scene, "-o", f"{out}.npz"),
         ("evaluate", scene, "--against", scene),
     ):
         assert run(*arguments, *words) == 2

@@ -20,7 +20,6 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.commands.verify import verify
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.io.ply import PlySource
@@ -132,13 +131,6 @@ def test_saved_scores_take_one_search(project: Path, done: tuple[Path, CompressR
         read_scene(tmp_path / "b.fgs").read(slice(0, 9), ["means"])["means"].tolist()
         == read_scene(folder / "a.fgs").read(slice(0, 9), ["means"])["means"].tolist()
     )
-
-
-def test_score_writes_what_compress_computes(project: Path, done: tuple[Path, CompressResult], tmp_path: Path) -> None:
-    folder, _ = done
-    result = score_gaussians(project / "point_cloud.ply", tmp_path / "s.npz", holdout=4)
-    assert (tmp_path / "s.npz").read_bytes() == (folder / "s.npz").read_bytes()
-    assert result.scored_views == 6 and result.unseen == int(np.isneginf(np.load(tmp_path / "s.npz")["scores"]).sum())
 
 
 def test_decompress_gives_the_files_values(done: tuple[Path, CompressResult], tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.info import info
-from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.report.results import CompressResult
@@ -92,8 +91,6 @@ def test_outputs_are_checked_before_any_work(project: Path, tmp_path: Path) -> N
             compress(missing, output)
     with pytest.raises(InputError, match=r"ends in \.ply"):
         decompress(missing, tmp_path / "a.fgs")
-    with pytest.raises(InputError, match=r"ends in \.npz"):
-        score_gaussians(missing, tmp_path / "a.txt")
     assert (tmp_path / "old.fgs").read_text() == "precious"
 
 

@@ -25,12 +25,8 @@ def run(words: list[str], limit: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("words", "output"),
-    [
-        (["compress", "--method", "paper"], "scene.fgs"),
-        (["score"], "scores.npz"),
-        (["render", "--views", "0,1,2"], "views"),
-    ],
-    ids=["paper", "score", "render"],
+    [(["compress", "--method", "paper"], "scene.fgs"), (["render", "--views", "0,1,2"], "views")],
+    ids=["paper", "render"],
 )
 def test_the_named_limit_is_kept(words: list[str], output: str, tmp_path: Path) -> None:
     check_limit([words[0], str(SAMPLE), *words[1:], "-o", str(tmp_path / output)], tmp_path / "found.json")
@@ -48,7 +44,6 @@ def fine_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         ["compress", "{file}", "--method", "paper", "--best-effort", "-o", "{folder}/scene.fgs"],
-        ["score", "{file}", "-o", "{folder}/scores.npz"],
         ["render", "{file}", "--views", "0,1,2", "-o", "{folder}/views"],
         ["evaluate", "{file}", "--against", str(SAMPLE)],
     ],

@@ -15,7 +15,6 @@ from flexgs_edge.commands.decompress import ANTIALIASED_NOTE, decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import FormatError
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.run.inputs import load_scene
@@ -105,7 +104,8 @@ def test_scores_are_those_of_the_way_of_drawing(model: Path, tmp_path: Path) -> 
     scores = {}
     for antialiased in (None, True, False):
         path = tmp_path / f"{antialiased}.npz"
-        score_gaussians(model, path, antialiased=antialiased, **VIEWS)
+        fixed: dict[str, Any] = {"method": "paper", "prune_rate": 0.0, "sh_rate": 0.0, "images": "none", **COMMON}
+        compress(model, tmp_path / "a.fgs", antialiased=antialiased, score_cache=str(path), **fixed)
         scores[antialiased] = np.load(path)["scores"]
     assert np.array_equal(scores[None], scores[True])
     assert (

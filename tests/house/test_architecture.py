@@ -70,7 +70,6 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("plots", "studies/result_tables.py", "import matplotlib"),
         ("pages", "run/reporter.py", "def late() -> None:\n    import jinja2"),
         ("pages", "studies/page.py", "import markupsafe"),
-        ("distributed", "views/worker.py", "import distributed"),
     ],
 )
 def test_a_planted_violation_is_seen(copy: Path, contract: str, module: str, statement: str) -> None:

@@ -63,10 +63,9 @@ def test_all_commands_give_the_same_bytes(project: Path, environment: dict[str, 
         run(environment, "compress", scene, "-o", folder / "paper.fgs", "--method", "paper", "--max-drop", 4, *view)
         run(environment, "compress", scene, "-o", folder / "best.fgs", "--effort", "fast", "--max-drop", 2, *view)
         run(environment, "render", scene, *cameras, "-o", folder / "views", "--views", "0,3", *named)
-        run(environment, "score", scene, *cameras, "-o", folder / "scores.npz", *named)
         run(environment, "decompress", folder / "best.fgs", "-o", folder / "best.ply", *named)
         made[device] = {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-    assert len(made[NAME]) >= 6
+    assert len(made[NAME]) >= 5
     for device in DEVICES[1:]:
         assert made[device].keys() == made[NAME].keys()
         assert [name for name in made[NAME] if made[NAME][name] != made[device][name]] == [], device

@@ -58,7 +58,7 @@ def everything(form: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndar
             assert renderer.parts is not None
             counts.append(sum(part.count for part in renderer.parts.values()))
             found.append(renderer.read_sums(renderer.removal_sums(scene, camera), 2, ROWS))
-        sums = ViewSums(RenderContext(renderer), scene, [cost_sums(renderer, 2)])
+        sums = ViewSums(renderer, scene, [cost_sums(renderer, 2)])
         assert len(list(sums.draw("removal_sums", views()))) == 4
         parts = cost_parts(2, ROWS, renderer.storage)
         for rows, (costs,) in sums.parts():
@@ -102,7 +102,7 @@ def test_parts_of_views_on_kernels_and_twins(form: str, monkeypatch: pytest.Monk
     paired = PairedBackend(open_form(form), 2)
     renderer = Renderer(paired, large_budget())
     with renderer.load(wide_scene()) as scene:
-        sums = ViewSums(RenderContext(renderer), scene, [cost_sums(renderer, 2)])
+        sums = ViewSums(renderer, scene, [cost_sums(renderer, 2)])
         assert len(list(sums.draw("removal_sums", views()[:2]))) == 2
         assert renderer.parts is not None
         assert 0 < sum(part.count for part in renderer.parts.values()) < ROWS

@@ -11,7 +11,6 @@ import pytest
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.commands.score import score_gaussians
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.units import parse_size
 from tiny_project import make_project
@@ -39,15 +38,11 @@ def test_that_of_an_evaluation_as_well(tmp_path: Path) -> None:
     evaluate(scene, scene, memory_limit=named(caught.value), device="numpy")
 
 
-@pytest.mark.parametrize("command", ["render", "score"])
-def test_that_of_drawing_as_well(command: str, tmp_path: Path) -> None:
+def test_that_of_drawing_as_well(tmp_path: Path) -> None:
     scene = make_project(tmp_path) / "point_cloud.ply"
 
     def run(limit: int) -> None:
-        if command == "render":
-            render_views(scene, tmp_path / "views", force=True, device="numpy", memory_limit=limit)
-        else:
-            score_gaussians(scene, tmp_path / "scores.npz", force=True, device="numpy", memory_limit=limit)
+        render_views(scene, tmp_path / "views", force=True, device="numpy", memory_limit=limit)
 
     with pytest.raises(BudgetError, match="which counts later stages too") as caught:
         run(2**20)

@@ -71,24 +71,8 @@ class CountingBench(RenderContext):
 
 def counting(judge: QualityEvaluator) -> CountingBench:
     """The judge's bench from now on, which counts."""
-    judge.context = CountingBench(judge.context.renderer, judge.context.cluster)
+    judge.context = CountingBench(judge.context.renderer)
     return judge.context
-
-
-class Workers:
-    """A cluster of one renderer."""
-
-    ready = True
-
-    def __init__(self, renderer: Renderer) -> None:
-        self._renderer = renderer
-
-    def planes(self, source: SceneSource, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
-        with self._renderer.load(source) as scene:
-            yield from (self._renderer.render_planes(scene, camera) for camera in cameras)
-
-    def close(self) -> None:
-        pass
 
 
 def test_references_that_do_not_fit_are_drawn_again(judged: MakeJudge, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,22 +122,16 @@ def test_flip_is_added_to_what_is_known(judged: MakeJudge) -> None:
     assert found[0] == found[1] and found[0].flip_photo is not None and found[0].ssim_photo is not None
 
 
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_scenes_that_are_not_on_the_backend_are_known_again(
-    elsewhere: bool, judged: MakeJudge, monkeypatch: pytest.MonkeyPatch
+def test_streamed_scenes_are_known_again_once_they_were_drawn(
+    judged: MakeJudge, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that are streamed once they have been drawn, those that others draw at once."""
-    if not elsewhere:
-        use_fit(monkeypatch, whole_views=False)
+    use_fit(monkeypatch, whole_views=False)
     with judged(reports=True) as (judge, source, renderer, _):
-        if elsewhere:
-            judge.context.cluster = Workers(renderer)  # type: ignore[assignment]
         bench, planes = counting(judge), half_of(source)
 
         def compare(planes: dict[str, np.ndarray]) -> object:
             with renderer.load(MemorySource(planes)) as loaded:
-                if not elsewhere:
-                    renderer.render(loaded, judge.cameras[0])
+                renderer.render(loaded, judge.cameras[0])
                 return judge.compare(loaded, with_ssim=True)
 
         first = compare(planes)

@@ -127,7 +127,7 @@ def measure_costs(
 ) -> RemovalCosts:
     """Measure costs in one pass, which takes about twice the time of rendering the poses."""
     degree = scene.sh_degree if sh_costs else 0
-    costs = ViewSums(context, scene, [cost_sums(context.renderer, degree)])
+    costs = ViewSums(context.renderer, scene, [cost_sums(context.renderer, degree)])
     try:
         for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
             pass

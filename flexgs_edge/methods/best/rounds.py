@@ -259,10 +259,12 @@ class PruneRounds:
         return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
-        costs = ViewSums(self.original.context, scene, [cost_sums(self.original.context.renderer, scene.sh_degree)])
+        costs = ViewSums(
+            self.original.context.renderer, scene, [cost_sums(self.original.context.renderer, scene.sh_degree)]
+        )
         try:
             keep = keep and self.refit
-            drawn = costs.draw("removal_sums", [self.original.cameras[view] for view in views], pictures=keep)
+            drawn = costs.draw("removal_sums", [self.original.cameras[view] for view in views])
             for view, picture in zip(
                 self.original.progress.track(views, "measuring costs", len(views)), drawn, strict=True
             ):
@@ -280,7 +282,7 @@ class PruneRounds:
             cost_sums(self.original.context.renderer, scene.sh_degree, first=4),
             normal_sums(self.original.context.renderer),
         ]
-        both = ViewSums(self.original.context, scene, makers)
+        both = ViewSums(self.original.context.renderer, scene, makers)
         # The rounds drop no SH: only a multiplier does, later.
         degrees = np.full(scene.count, 4, np.uint8)
         try:

@@ -62,7 +62,7 @@ def refit_colours(
     sum_bytes_a_row = sum_bytes(4) + normal_bytes(source.sh_degree if bands else 0)
     with renderer.load(source, sum_bytes_a_row, references=True, view_sums=4) as scene:
         for part in original.progress.track(parts, "refitting colours", len(parts)):
-            normal = ViewSums(context, scene, [normal_sums(renderer, bands)])
+            normal = ViewSums(renderer, scene, [normal_sums(renderer, bands)])
             try:
                 for camera, view in zip(renderer.in_turn(scene, [cameras[view] for view in part]), part, strict=True):
                     normal.add_view(renderer.residual_sums(scene, camera, original.references[view]), camera)
