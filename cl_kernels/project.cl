@@ -85,7 +85,8 @@ __kernel void project(
   FW level2 = (level + (FW)(LOG2_255 + EXTENT_SLACK)) * (FW)(2.0f / LOG2_E);  // the ellipse's q, natural units
   FW t2 = larger(level2, (FW)0.0f);
   FW half_width = sqrt(t2 * a), half_height = sqrt(t2 * c);
-  FW width = CAM(24), height = CAM(25);
+  const float width_pixels = camera[24], height_pixels = camera[25];
+  const FW width = (FW)width_pixels, height = (FW)height_pixels;
   // Written so that NaN and infinity fail all tests.
   shown &= MASK(det > (FW)0.0f) & MASK(det < (FW)INFINITY) & MASK(a < (FW)INFINITY) & MASK(c < (FW)INFINITY);
   shown &= MASK(mx + half_width >= (FW)-1.0f) & MASK(mx - half_width <= width);
@@ -100,7 +101,7 @@ __kernel void project(
   out[3] = -(b + b) * k;
   out[4] = a * k;
   out[5] = level;
-  // Numbers for the tile lists: x of the ellipse's right end, its half height, axis slope b/c, 1/c, det/c and level.
+  // Numbers for the tile lists: x of the ellipse's right end, its half height, axis slope b/c, 1/c, det/c and level; then its only tile.
   FW ic = quotient((FW)1.0f, c);
   out[9] = quotient(b, a) * half_width;
   out[10] = half_height;
@@ -108,7 +109,6 @@ __kernel void project(
   out[12] = ic;
   out[13] = det * ic;
   out[14] = t2;
-  out[15] = (FW)0.0f;  // fills the record
 
   // Tiles of the bounding box, inclusive: twice the slack of the spans in tiles.cl, since this sets the size of the pair buffer.
   FW sx = (FW)2.0f * fma(half_width, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
@@ -124,6 +124,25 @@ __kernel void project(
   y1 = smaller(y1, last_y);
   shown &= MASK(x1 >= x0) & MASK(y1 >= y0);
   FW tiles = (x1 - x0 + (FW)1.0f) * (y1 - y0 + (FW)1.0f);
+
+  // Most splats of a large scene lie in one tile. Their blocks in it are found here, for W splats at a time, and kept beside the tile's
+  // number. A splat between all pixels has no blocks: it is not shown.
+  const int tiles_x = ((int)width_pixels + TILE - 1) / TILE, tiles_y = ((int)height_pixels + TILE - 1) / TILE;
+  IW only = shown & MASK(tiles == (FW)1.0f) & (IW)(tiles_x * tiles_y <= MOST_NUMBERED ? -1 : 0);
+  out[15] = (FW)0.0f;
+  if (ANY(only)) {
+    const IW column = whole(x0), row = whole(y0);
+    IW mask = (IW)0;
+    for (int band = 0; band < 4; ++band) {
+      IW first, last;
+      block_spans(row * (IW)4 + (IW)band, mx, my, out[9], half_height, out[11], ic, out[13], t2, width_pixels, &first, &last);
+      first -= column * (IW)4;
+      last -= column * (IW)4;
+      mask |= row_mask(picki(MASK(first > (IW)0), first, (IW)0), picki(MASK(last < (IW)3), last, (IW)3)) << (IW)(4 * band);
+    }
+    out[15] = AS_F(picki(only, ((row * (IW)tiles_x + column) << (IW)16) | mask, (IW)0));
+    shown &= ~only | MASK(mask != (IW)0);
+  }
 
   if (ANY(shown)) {
     FW dx, dy, dz;

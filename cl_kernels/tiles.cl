@@ -8,27 +8,11 @@
 #else
 #define BANDS 16
 #endif
-#define EMPTY_FIRST (1 << 28)
-#define EMPTY_LAST (-1)
 
-// First and last block column of a splat in W block rows from `band` on; in an empty row, first > last.
-// The ellipse is convex. So its right end within a row lies at its overall right end, clamped into the row; likewise the left.
-inline void block_spans(__global const float *r, int band, float width, IW *first, IW *last) {
-  const FW my = (FW)r[1], hh = (FW)r[10], slope = (FW)r[11];
-  FW top = TO_F((LANE_INDEX + (IW)band) * (IW)BLOCK) - my;
-  FW slack = fma(hh, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-  FW low = larger(top, -(hh + slack)), high = smaller(top + (FW)(BLOCK - 1), hh + slack);
-  FW right_dy = smaller(larger((FW)r[9], low), high), left_dy = smaller(larger((FW)-r[9], low), high);
-  FW right_root = sqrt(larger((FW)r[14] - right_dy * right_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
-  FW left_root = sqrt(larger((FW)r[14] - left_dy * left_dy * (FW)r[12], (FW)0.0f) * (FW)r[13]);
-  FW right = fma(slope, right_dy, right_root), left = fma(slope, left_dy, -left_root);
-  FW right_slack = fma(fabs(slope * right_dy) + right_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-  FW left_slack = fma(fabs(slope * left_dy) + left_root, (FW)SPAN_SLACK_RELATIVE, (FW)SPAN_SLACK);
-  FW x0 = round_up(smaller(larger((FW)r[0] + left - left_slack, (FW)0.0f), (FW)width));
-  FW x1 = round_down(smaller(larger((FW)r[0] + right + right_slack, (FW)-1.0f), (FW)(width - 1.0f)));
-  IW some = MASK(low <= high) & MASK(x0 <= x1);
-  *first = picki(some, whole(x0) >> 2, (IW)EMPTY_FIRST);
-  *last = picki(some, whole(x1) >> 2, (IW)EMPTY_LAST);
+// First and last block column of a splat in W block rows from `band` on.
+inline void splat_spans(__global const float *r, int band, float width, IW *first, IW *last) {
+  block_spans(LANE_INDEX + (IW)band, (FW)r[0], (FW)r[1], (FW)r[9], (FW)r[10], (FW)r[11], (FW)r[12], (FW)r[13], (FW)r[14], width, first,
+              last);
 }
 
 // The 16-bit block mask of a tile, bit 4 * row + column. `first` and `last` are the spans of the tile's four block rows.
@@ -61,7 +45,7 @@ inline int2 rows_of_tiles(__global const float *r, float height) {
     const int bands = min(BANDS, 4 * (ty1 - top + 1));                                                          \
     for (int v = 0; v < bands; v += W) {                                                                        \
       IW f, l;                                                                                                  \
-      block_spans(r, top * 4 + v, width, &f, &l);                                                               \
+      splat_spans(r, top * 4 + v, width, &f, &l);                                                               \
       STOREI(f, first, v);                                                                                      \
       STOREI(l, last, v);                                                                                       \
     }                                                                                                           \
@@ -182,6 +166,11 @@ __kernel LISTERS void tile_count(
   for (uint n = start; n < end; ++n) {
     FETCH(records + (size_t)ids[min(n + AHEAD, end - 1)] * 16);
     __global const float *r = records + (size_t)ids[n] * 16;
+    const uint only = as_uint(r[15]);
+    if (only) {
+      DRAFT_PAIR(only >> 16, only & 0xFFFFu);
+      continue;
+    }
     const int2 span = rows_of_tiles(r, height);
     for (int top = span.s0; top <= span.s1; top += BANDS / 4) {
       FOR_EACH_TILE(r, top, span.s1, DRAFT_PAIR)

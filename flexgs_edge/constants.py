@@ -62,6 +62,8 @@ EXTENT_SLACK: Final = 4e-6
 1e-6), so that no pixel with alpha >= 1/255 is left out."""
 SPAN_SLACK: Final = 2e-3  # Pixels added to both ends of a block row's span: 16 ulp at pixel 2000
 SPAN_SLACK_RELATIVE: Final = 2e-6  # Share of a span's own length that is added too: 16 roundings of the span's formula
+MOST_NUMBERED: Final = 1 << 16
+"""Splats of one tile keep its number beside its 16-bit mask, in pictures of at most so many tiles."""
 CULLED: Final = 0xFFFFFFFF
 """Sort key of a Gaussian that the view does not show. These are the bits of a NaN, which no depth has."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flexgs_edge.constants import (
@@ -9,6 +11,7 @@ from flexgs_edge.constants import (
     EXTENT_SLACK,
     LOG2_255,
     LOG2_E,
+    MOST_NUMBERED,
     ROW_BLOCK,
     SH_C0,
     SH_C1,
@@ -21,6 +24,7 @@ from flexgs_edge.constants import (
     TILE,
 )
 from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32, flog2, fma
+from flexgs_edge.kernels.twins.tiles import only_tiles
 
 _LOG2_E = f32(LOG2_E)
 
@@ -71,8 +75,8 @@ def block_rows(blocks: Array, first: int, count: int) -> Array:
     return rows
 
 
-def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tuple[Array, Array]:
-    """Number of tiles of the bounding box, and whether there are any."""
+def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tuple[Array, Array, Array, Array]:
+    """Number of tiles of the bounding box, whether there are any, and column and row of the first one."""
     per_tile, spans = f32(1.0 / TILE), []
     for centre, half_extent, slack_factor, pixels in ((mx, half[0], f32(2), cam[24]), (my, half[1], f32(1), cam[25])):
         slack = slack_factor * fma(half_extent, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
@@ -82,7 +86,7 @@ def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tupl
         last = np.fmin(last, np.floor((pixels - f32(1)) * per_tile))
         spans.append((first, last))
     (x0, x1), (y0, y1) = spans
-    return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0)
+    return (x1 - x0 + f32(1)) * (y1 - y0 + f32(1)), (x1 >= x0) & (y1 >= y0), x0, y0
 
 
 def _from_covariance(cov: Array, t0: Triple, t1: Triple, dilation: np.float32) -> tuple[Array, Array, Array, Array]:
@@ -164,15 +168,20 @@ def project(
 
     k = (f32(1) / det) * (f32(0.5) * _LOG2_E)
     ic = f32(1) / c
-    tiles, some = _bounds(mx, my, half, cam)
+    tiles, some, column, row = _bounds(mx, my, half, cam)
     shown &= some
 
+    out = np.zeros((count, 16), f32)
+    fields = (mx, my, c * k, -(b + b) * k, a * k, level), ((b / a) * half[0], half[1], b * ic, ic, det * ic, t2)
+    out[:, :6], out[:, 9:15] = np.stack(fields[0], axis=1), np.stack(fields[1], axis=1)
+    if math.prod(-(-int(pixels) // TILE) for pixels in cam[24:26]) <= MOST_NUMBERED:
+        one = np.flatnonzero(shown & (tiles == 1))
+        words = only_tiles(out[one], column[one], row[one], cam[24])
+        out[one, 15] = words.view(f32)
+        shown[one] = (words & 0xFFFF) > 0
     rows = np.flatnonzero(shown)
-    colours = _colours(rows, degree, cam, (px, py, pz), sh_dc[:, own], sh_rest[:, own])
-    out = [mx, my, c * k, -(b + b) * k, a * k, level, *colours]
-    out += [(b / a) * half[0], half[1], b * ic, ic, det * ic, t2, np.zeros_like(a)]
-    for field, values in enumerate(out):
-        records[base + rows, field] = values if 6 <= field <= 8 else values[rows]
+    out[rows, 6:9] = np.stack(_colours(rows, degree, cam, (px, py, pz), sh_dc[:, own], sh_rest[:, own]), axis=1)
+    records[base + rows] = out[rows]
     keys[base : base + count] = np.where(shown, z.view(np.uint32), np.uint32(CULLED))
     bounds[base : base + count] = np.where(shown, tiles, 0).astype(np.uint32)
 

@@ -33,6 +33,23 @@ def block_spans(records: Array, bands: Array, width: np.float32) -> tuple[Array,
     return np.where(some, x0.astype(np.int32) >> 2, EMPTY[0]), np.where(some, x1.astype(np.int32) >> 2, EMPTY[1])
 
 
+def _tile_masks(first: Array, last: Array, column: Array) -> Array:
+    """[m] u32, blocks of tiles in columns of tiles ([m]), bit 4 * row + column, from the spans of their rows ([m, 4])."""
+    start, end = np.maximum(first - 4 * column[:, None], 0), np.minimum(last - 4 * column[:, None], 3)
+    bits = ((1 << (np.clip(end, 0, 3) + 1)) - 1) & ~((1 << np.clip(start, 0, 4)) - 1)
+    masks: Array = np.where(start <= end, bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
+    return masks
+
+
+def only_tiles(records: Array, column: Array, row: Array, width: np.float32) -> Array:
+    """[m] u32, number and mask of the only tile of splats ([m, 16]), which lies in a column and a row of tiles ([m] each)."""
+    column, row = column.astype(np.int32), row.astype(np.int32)
+    first, last = block_spans(records, row[:, None] * (TILE // BLOCK) + _BANDS, width)
+    number = (row * np.int32(-(-int(width) // TILE)) + column).astype(np.uint32)
+    words: Array = number << np.uint32(16) | _tile_masks(first, last, column)
+    return words
+
+
 def _expand(first: Array, last: Array) -> tuple[Array, Array]:
     """(owner, value) for every value in [first, last] of each owner."""
     counts = np.maximum(last - first + 1, 0)
@@ -51,10 +68,7 @@ def list_pairs(ids: Array, records: Array, width: np.float32, height: np.float32
     splat, ty = _expand(y0 // TILE, y1 // TILE)
     first, last = block_spans(splats[splat], (ty[:, None] * (TILE // BLOCK) + _BANDS).astype(np.int32), width)
     row, tx = _expand(first.min(axis=1, initial=EMPTY[0]) >> 2, last.max(axis=1, initial=EMPTY[1]) >> 2)
-    start = np.maximum(first[row] - 4 * tx[:, None], 0)
-    end = np.minimum(last[row] - 4 * tx[:, None], 3)
-    bits = ((1 << (np.clip(end, 0, 3) + 1)) - 1) & ~((1 << np.clip(start, 0, 4)) - 1)
-    mask = np.where(start <= end, bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
+    mask = _tile_masks(first[row], last[row], tx)
     keep = mask != 0
     return splat[row][keep], (ty[row] * tiles_x + tx)[keep], mask[keep]
 
