@@ -23,11 +23,11 @@ from benchmarks.harness import ROOT
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.conventions import other_conventions
 from flexgs_edge.errors import InputError
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run, open_run
-from flexgs_edge.views.render_context import RenderContext
 
 GOOD = 67
 """Good runs a scene: 200 over three scenes."""
@@ -82,12 +82,12 @@ def changes(rng: np.random.Generator) -> list[Change]:
     ]
 
 
-def verdict(run: Run[Any], context: RenderContext, cameras: list[Camera], load: Load) -> str:
+def verdict(run: Run[Any], renderer: Renderer, cameras: list[Camera], load: Load) -> str:
     """`""` if the views pass, else the warning or the error."""
     photos: Any = MadePhotos(lambda i: load(i).astype(np.float32))
     try:
         return " ".join(
-            check_views(replace(run, views=replace(run.seen, cameras=cameras, photos=photos)), context, False).warnings
+            check_views(replace(run, views=replace(run.seen, cameras=cameras, photos=photos)), renderer, False).warnings
         )
     except InputError as error:
         return f"refused: {error}"
@@ -106,13 +106,13 @@ def measure(folder: Path, elsewhere: Path, resolution: int, with_misfits: bool) 
         image = Image.fromarray((strange(i % len(others.cameras)) * 255).astype(np.uint8)).resize(shape)
         return np.asarray(image, np.float32) / 255
 
-    with open_context(run) as context:
+    with open_renderer(run) as renderer:
         start = time.perf_counter()
-        assert verdict(run, context, views.cameras, photo) == ""
+        assert verdict(run, renderer, views.cameras, photo) == ""
         print(f"{folder.name}: right views at width {resolution}: {time.perf_counter() - start:.2f} s", flush=True)
         if with_misfits:
             cases = misfits(views.cameras, photo, other)
-            found = {name: verdict(run, context, cameras, load) for name, cameras, load in cases}
+            found = {name: verdict(run, renderer, cameras, load) for name, cameras, load in cases}
             refused = [name for name, words in found.items() if words.startswith("refused")]
             print(f"{folder.name}: {len(refused)} of {len(found)} misfits refused", flush=True)
             for name, words in found.items():
@@ -127,7 +127,7 @@ def measure(folder: Path, elsewhere: Path, resolution: int, with_misfits: bool) 
             def load(i: int, some: list[int] = some, change: Change = change) -> np.ndarray:
                 return change(photo(some[i]), some[i])
 
-            words = verdict(run, context, views.of(some), load)
+            words = verdict(run, renderer, views.of(some), load)
             if words:
                 wrong.append(f"{len(some)} views, change {number % 6}: {words[:160]}")
         refused = [words for words in wrong if ": refused" in words]

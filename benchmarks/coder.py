@@ -37,7 +37,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
 """Step sizes of position, scale, rotation, opacity and constant colour, in fox's units."""
@@ -98,7 +97,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
     backend = open_backend(device, budget)
     source, cameras = scene.source, views.of(views.train)
     renderer = Renderer(backend, budget, near=DEFAULT_NEAR)
-    judge = QualityEvaluator(RenderContext(renderer), source, views, views.held_out)
+    judge = QualityEvaluator(renderer, source, views, views.held_out)
     try:
         with renderer.load(source) as original:
             judge.prepare(original, progress)
@@ -113,7 +112,7 @@ def base_payload(scene_path: Path, output: Path, steps: StepSizes, device: str |
             refitted = refit_colours(
                 start,
                 degrees,
-                Original(RenderContext(renderer), source.origin, cameras, targets, (), progress),
+                Original(renderer, source.origin, cameras, targets, (), progress),
                 ROUNDS,
                 False,
                 SUBSETS,

@@ -31,7 +31,6 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.progress import Progress
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.render_context import RenderContext
 
 ROUNDING = 2.0**-22
 """Rounding error of a pixel's change by a removal, divided by alpha / (1 - alpha). Float32 rounds the light from behind a few
@@ -234,9 +233,7 @@ def main() -> None:
             renderer = Renderer(backend, budget)
             with renderer.load(source) as scene:
                 if rows is None:
-                    rows = spread_over_range(
-                        measure_costs(RenderContext(renderer), scene, poses, False).removal, options.gaussians
-                    )
+                    rows = spread_over_range(measure_costs(renderer, scene, poses, False).removal, options.gaussians)
                 least = 0.0 if name == "ending off" else TRANSMITTANCE_MIN
                 found = compare_in_float64(renderer, scene, poses, rows, least, Progress())
             renderer.release()

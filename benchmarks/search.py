@@ -22,7 +22,6 @@ from flexgs_edge.run.inputs import load_scene, resolve_drawing
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import find_views
-from flexgs_edge.views.render_context import RenderContext
 
 CHOICE = Choice(400, 400)
 """Where the search begins: 40 % of the Gaussians pruned, a further 40 % without SH."""
@@ -38,7 +37,7 @@ def main() -> None:
     views = find_views(resolve_drawing(ViewOptions(), scene, companions), companions, scene.source)
     assert views is not None
     renderer = Renderer(backend, budget)
-    judge = QualityEvaluator(RenderContext(renderer), scene.source, views, views.held_out)
+    judge = QualityEvaluator(renderer, scene.source, views, views.held_out)
     with renderer.load(scene.source) as original:
         judge.prepare(original)
     # The choice of Gaussians hardly changes the time of a step, so opacity times volume will do as a score.

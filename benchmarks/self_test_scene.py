@@ -40,7 +40,6 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
-from flexgs_edge.views.render_context import RenderContext
 
 BLOCKS = 5
 """Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""
@@ -249,7 +248,7 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
         # A sampled view, whose window is shorter than the array of its taps: who reads behind it finds no zeros.
         view = camera(66, 60, 0.3, 1.5).every(2)
     drawer = Renderer(backend, budget, antialiased=degree == 2, fit=Fit(pairs=PAIRS))
-    bench = RenderContext(drawer)
+    bench = drawer
     with drawer.load(source) as loaded:
         measure_costs(bench, loaded, [view])
         image = drawer.render_planes(loaded, view)

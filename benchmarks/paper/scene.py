@@ -22,14 +22,14 @@ from flexgs_edge.methods.paper.search import adapt
 from flexgs_edge.packed.bitspec import PAPER, BitSpec
 from flexgs_edge.progress import Progress
 from flexgs_edge.quality.psnr import error_for_drop
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.plan import EVERYTHING, Plan
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.studies.result_tables import Cell, figures
-from flexgs_edge.views.render_context import RenderContext
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -62,15 +62,15 @@ class StudyScene:
         self,
         name: str,  # name of the scene, for tables and folders
         run: Run[CompressOptions],  # As for `compress`. The plan's views and figure decide here too.
-        context: RenderContext,  # draws the views
+        renderer: Renderer,  # draws the views
         judge: QualityEvaluator,  # prepared, with the original's renders
         orders: dict[str, np.ndarray],  # [N] i64 by name of the score: rows, least important first
         has_sh: np.ndarray,  # [N] bool, rows with SH that are not zero
     ) -> None:
-        self.name, self.run, self.context, self.judge, self.orders, self.has_sh = (
+        self.name, self.run, self.renderer, self.judge, self.orders, self.has_sh = (
             name,
             run,
-            context,
+            renderer,
             judge,
             orders,
             has_sh,
@@ -197,11 +197,10 @@ def open_study_scene(
     with clock.stage("open"):
         has_sh = nonzero_sh(source)
     with ExitStack() as stack:
-        context = stack.enter_context(open_context(run))
-        renderer = context.renderer
+        renderer = stack.enter_context(open_renderer(run))
         run.budget.take("ranks", RANK_BYTES * source.count * len(scores))
         judge = QualityEvaluator(
-            context, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr
+            renderer, source, views, plan.decide, plan.figure == "drop", base_psnr=options.base_psnr
         )
         stack.callback(judge.close)
         with clock.stage("load"):
@@ -217,7 +216,7 @@ def open_study_scene(
                     found = score_scene(renderer, original, source, cameras, score, progress)
                     orders[score] = order_from_scores(found)
         renderer.release()
-        yield StudyScene(name, run, context, judge, orders, has_sh)
+        yield StudyScene(name, run, renderer, judge, orders, has_sh)
 
 
 def beside(what: str, here: str, paper: str) -> str:

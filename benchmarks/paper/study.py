@@ -12,7 +12,7 @@ from benchmarks.paper import pruning, quantization, whole
 from benchmarks.paper.scene import StudyScene, open_study_scene
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_context import context_info
+from flexgs_edge.run.open_renderer import drawn_info
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import views_info
 from flexgs_edge.studies.result_tables import Experiment
@@ -76,5 +76,5 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress, maker
             views_info(studied.views),
             studied.decided_by,
             tuple(experiments),
-            context_info(studied.run, studied.context),
+            drawn_info(studied.run, studied.renderer),
         )

@@ -58,7 +58,7 @@ def parts(studied: StudyScene) -> Experiment:
     """Measure ADP only, MPQ only, and both, at the choice of the search."""
     choice = studied.search.chosen.choice
     pruned = _pruned(studied, choice)
-    with studied.context.renderer.load(pruned) as scene:
+    with studied.renderer.load(pruned) as scene:
         alone = measurement_of(studied.judge.compare(scene))
     quantized, both = studied.points([Setting(), Setting(choice)], "parts")
     none = Measurement(0.0 if studied.plan.figure == "drop" else None, None, 0.0)
@@ -222,11 +222,7 @@ def _step_parts(studied: StudyScene, choice: Choice) -> dict[str, float]:
     """Median seconds of a step's parts, as `SceneEvaluator.measure` does them."""
     ranks = ranks_from_order(studied.orders["gs"])
     found: list[list[float]] = []
-    evaluator, renderer, first = (
-        studied.evaluator(Setting(choice)),
-        studied.context.renderer,
-        studied.judge.cameras[0],
-    )
+    evaluator, renderer, first = (studied.evaluator(Setting(choice)), studied.renderer, studied.judge.cameras[0])
     for _ in range(REPEATS):
         marks = [time.perf_counter()]
         select_rows(ranks, choice, studied.has_sh)

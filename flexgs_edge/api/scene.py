@@ -15,7 +15,7 @@ from flexgs_edge.errors import InputError, brief
 from flexgs_edge.io.ply import choose_origin, origin_rows
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.run.inputs import CheckedScene, checked_scene, companions_of, load_scene
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.scene.fields import FIELD
@@ -212,8 +212,8 @@ class Scene:
             cameras=NO_CAMERAS, device=device, memory_limit=memory_limit, near=near, background=background
         )
         run = open_run(self.checked, options, photos=False)
-        with open_context(run) as context, context.renderer.load(run.source) as loaded:
-            return np.ascontiguousarray(context.renderer.render(loaded, camera), np.float32)
+        with open_renderer(run) as renderer, renderer.load(run.source) as loaded:
+            return np.ascontiguousarray(renderer.render(loaded, camera), np.float32)
 
     def __repr__(self) -> str:
         return f"Scene({self.source.name!r}: {self.count} Gaussians, SH degree {self.sh_degree})"

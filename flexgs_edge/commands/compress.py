@@ -16,19 +16,19 @@ from flexgs_edge.methods.best import method as best
 from flexgs_edge.methods.foreign import method as foreign
 from flexgs_edge.methods.paper import method as paper
 from flexgs_edge.progress import LOG, SILENT, Progress
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.inputs import ScenePlace, scene_info
 from flexgs_edge.run.live import live_scenes
 from flexgs_edge.run.method_result import MethodResult
-from flexgs_edge.run.open_context import context_info, open_context
+from flexgs_edge.run.open_renderer import drawn_info, open_renderer
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_compression
 from flexgs_edge.run.view_set import GivenViews, views_info
 from flexgs_edge.run.warnings import view_warnings
-from flexgs_edge.views.render_context import RenderContext
 
 
 def compress(
@@ -50,15 +50,15 @@ def compress(
     run = open_compression(input, output, options, progress, given)
     method = paper if options.method == "paper" else best if run.output.format is None else foreign
     with ExitStack() as stack:
-        context = None
+        renderer = None
         if run.views is None:
             run.budget.require("the scene", 0)
         else:
             needed = partial(method.expected_bytes, run)
-            context = stack.enter_context(open_context(run, needed))
-            run = check_views(run, context, options.trust_views)
-        made = method.compress(run, context)
-        result = _result(run, context, made)
+            renderer = stack.enter_context(open_renderer(run, needed))
+            run = check_views(run, renderer, options.trust_views)
+        made = method.compress(run, renderer)
+        result = _result(run, renderer, made)
     if run.output.path is not None and run.output.format is not None and run.output.offset is not None:
         LOG.info(write_offset(run.output.path, run.output.offset, run.output.format, options.force))
     if run.reporter is not None:
@@ -75,7 +75,7 @@ def _show_live(run: Run[CompressOptions], path: Path) -> None:
             run.reporter.show_live(lambda first: live_scenes(run, path, first))
 
 
-def _result(run: Run[CompressOptions], context: RenderContext | None, made: MethodResult) -> CompressResult:
+def _result(run: Run[CompressOptions], renderer: Renderer | None, made: MethodResult) -> CompressResult:
     """The record of a run; its warnings are logged."""
     options, plan, views, search = run.options, run.plan, run.views, made.search
     assert plan is not None
@@ -120,7 +120,7 @@ def _result(run: Run[CompressOptions], context: RenderContext | None, made: Meth
         quality_views=plan.kind_of(plan.report, views),
         score_cache=options.score_cache if plan.needs_scores else None,
         scores_reused=made.scores_reused,
-        run=context_info(run, context),
+        run=drawn_info(run, renderer),
         format=run.output.format.suffix[1:] if run.output.format else "fgs",
         file_sh_degree=made.sh_degree,
         preview_bytes=made.preview_bytes,

@@ -15,7 +15,7 @@ from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_context import context_info, open_context
+from flexgs_edge.run.open_renderer import drawn_info, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.reporter import Reporter
@@ -54,8 +54,8 @@ def evaluate(
         return drawing_bytes(run) + decode_bytes(run.source, None) + decode_bytes(scene.source, None)
 
     with ExitStack() as stack:
-        context = stack.enter_context(open_context(run, needed=needed))
-        run, renderer = check_views(run, context, trusted=True), context.renderer
+        renderer = stack.enter_context(open_renderer(run, needed=needed))
+        run = check_views(run, renderer, trusted=True)
         distance: Lpips | None = None
         if lpips:  # first, because packages or weights may be missing
             with clock.stage("lpips"):
@@ -64,7 +64,7 @@ def evaluate(
         with clock.stage("load"):
             spare = drawing_bytes(run) + decode_bytes(scene.source, None)
             original_source = read_often(run.source, budget, spare, renderer.backend)
-        judge = QualityEvaluator(context, original_source, views, indices, base_psnr=base_psnr)
+        judge = QualityEvaluator(renderer, original_source, views, indices, base_psnr=base_psnr)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(original_source) as original:
             judge.prepare(original, progress)
@@ -80,7 +80,7 @@ def evaluate(
             views=views_info(views),
             quality=quality,
             quality_views="held-out" if views.held_out else "training",
-            run=context_info(run, context),
+            run=drawn_info(run, renderer),
             warnings=run.warnings,
         )
     if reporter is not None:

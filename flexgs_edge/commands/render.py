@@ -19,7 +19,7 @@ from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_context import context_info, open_context
+from flexgs_edge.run.open_renderer import drawn_info, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import LIBRARY_BYTES
 from flexgs_edge.run.run import open_run
@@ -55,8 +55,7 @@ def render_views(
     def needed() -> int:
         return writing + drawing_bytes(run) + decode_bytes(run.source, None)
 
-    with open_context(run, needed=needed, compares=False) as context:
-        renderer = context.renderer
+    with open_renderer(run, needed=needed, compares=False) as renderer:
         run.budget.take("writing pictures", writing)
         with clock.stage("load"):
             source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
@@ -81,7 +80,7 @@ def render_views(
             files=tuple(os.fspath(place) for place in places),
             view_seconds=tuple(seconds),
             warm_up_seconds=warm_up,
-            run=context_info(run, context),
+            run=drawn_info(run, renderer),
         )
 
 

@@ -20,7 +20,7 @@ from flexgs_edge.report.file_results import RenderResult
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_context import context_info, open_context
+from flexgs_edge.run.open_renderer import drawn_info, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
@@ -51,8 +51,7 @@ def draw_sheet(
         return drawing_bytes(run) + decode_bytes(run.source, None)
 
     pictures, seconds = [], []
-    with open_context(run, needed=needed, compares=False) as context:
-        renderer = context.renderer
+    with open_renderer(run, needed=needed, compares=False) as renderer:
         with clock.stage("load"):
             source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
             device_scene = renderer.load(run.of_source(source).scene.drawn)
@@ -72,7 +71,7 @@ def draw_sheet(
             files=(os.fspath(output),),
             view_seconds=tuple(seconds),
             warm_up_seconds=0.0,
-            run=context_info(run, context),
+            run=drawn_info(run, renderer),
         )
 
 

@@ -376,3 +376,14 @@ class Renderer:
         if self._aimed is not None:
             self._aimed.release()
             self._aimed = None
+
+    def close(self) -> None:
+        """Free the view's buffers, and close the backend."""
+        self.release()
+        self.backend.close()
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

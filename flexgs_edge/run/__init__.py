@@ -1,1 +1,1 @@
-"""Code that all commands share: options, inputs, the plan, the render context, the evaluators."""
+"""Code that all commands share: options, inputs, the plan, the renderer, the evaluators."""

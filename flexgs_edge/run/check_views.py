@@ -27,7 +27,6 @@ from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.views.render_context import RenderContext
 
 RUNS, RUN = 5, 3
 """Views are compared in at most so many runs, evenly spread, of so many neighbours in order of name."""
@@ -61,10 +60,10 @@ class _Compared:
         return [math.nan if a is None and b is None else likeness(a, b) for a, b in pairs]
 
 
-def check_views(run: Run[Options], context: RenderContext, trusted: bool) -> Run[Options]:
+def check_views(run: Run[Options], renderer: Renderer, trusted: bool) -> Run[Options]:
     """Compare some views with their photos (stage `check views`).
 
-    `run`: with views. `context`: draws; nothing is loaded afterwards. `trusted`: warn of views that do not belong
+    `run`: with views. `renderer`: draws; nothing is loaded afterwards. `trusted`: warn of views that do not belong
     to the scene, and go on. Returns the run with the words among its warnings. Raises `InputError` when most views do not
     show the scene; the message names the likely cause.
     """
@@ -72,7 +71,7 @@ def check_views(run: Run[Options], context: RenderContext, trusted: bool) -> Run
     if views.cameras_from == AUTO_CAMERAS:
         return run
     with run.clock.stage("check views"):
-        found = _find_fault(run, context.renderer, views)
+        found = _find_fault(run, renderer, views)
     if found is None:
         return run
     words, fatal = found

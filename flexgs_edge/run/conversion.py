@@ -15,7 +15,7 @@ from flexgs_edge.io.formats import Format
 from flexgs_edge.report.file_results import ConversionLoss
 from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.run.inputs import CheckedScene, load_scene
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import open_run
@@ -65,11 +65,11 @@ def conversion_loss(
         if options.device != "numpy":
             run.budget.require("the OpenCL runtime", RUNTIME_BYTES + BUILD_BYTES)
         chosen = run.seen.held_out or run.seen.train
-        with open_context(run) as context:
-            judge = QualityEvaluator(context, run.source, run.seen, chosen)
-            with context.renderer.load(run.source) as original:
+        with open_renderer(run) as renderer:
+            judge = QualityEvaluator(renderer, run.source, run.seen, chosen)
+            with renderer.load(run.source) as original:
                 judge.prepare(original)
-            with context.renderer.load(written.source) as drawn:
+            with renderer.load(written.source) as drawn:
                 quality = judge.compare(drawn)
             judge.close()
     except (BudgetError, DeviceError, InputError) as error:

@@ -11,23 +11,23 @@ from flexgs_edge.memory.storage import Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import ahead, coding_device
 from flexgs_edge.run.few_poses import MOST, FewPoses, evenly, made_poses
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.render_context import RenderContext
 
 
 class Evaluators:
     """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
 
-    `run`: planned, with views. `context`: draws.
+    `run`: planned, with views. `renderer`: draws.
     """
 
-    def __init__(self, run: Run[Any], context: RenderContext) -> None:
+    def __init__(self, run: Run[Any], renderer: Renderer) -> None:
         assert run.plan is not None
-        self._run, self._context, self._plan = run, context, run.plan
+        self._run, self._renderer, self._plan = run, renderer, run.plan
         self.report = self._judge(run.plan.report, reports=True)
         on_train = run.plan.decide != run.plan.report
         self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
@@ -38,17 +38,17 @@ class Evaluators:
     def _judge(self, indices: list[int], reports: bool) -> QualityEvaluator:
         run = self._run
         words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "reports": reports}
-        return QualityEvaluator(self._context, run.source, run.seen, indices, **words)
+        return QualityEvaluator(self._renderer, run.source, run.seen, indices, **words)
 
     @property
     def storage(self) -> Storage:
         """Where large arrays of the run lie."""
-        return self._context.renderer.storage
+        return self._renderer.storage
 
     @contextmanager
     def original(self) -> Iterator[DeviceScene]:
         """The original, loaded once: its references are drawn at the start, and it is released at the end."""
-        run, renderer = self._run, self._context.renderer
+        run, renderer = self._run, self._renderer
         views, made = run.seen, None
         if self._plan.makes_poses:
             with run.clock.stage("load"):
@@ -70,7 +70,7 @@ class Evaluators:
 
     def _few(self, original: DeviceScene, cameras: Sequence[Camera]) -> FewPoses:
         covered_decides, progress = self.report.covered_decides, self._run.progress
-        return FewPoses(self._context.renderer, original, cameras, covered_decides, progress)
+        return FewPoses(self._renderer, original, cameras, covered_decides, progress)
 
     def prepare(self) -> None:
         """Draw the references, where nothing else is asked of the original."""
@@ -79,13 +79,13 @@ class Evaluators:
 
     def measure(self, source: SceneSource) -> Quality:
         """Quality of a decoded file."""
-        renderer, budget = self._context.renderer, self._run.budget
+        renderer, budget = self._renderer, self._run.budget
         with ahead(source, budget, coding_device(renderer.backend, budget, source.count, source.sh_degree)):
             return self._compare(lambda: renderer.load(source))
 
     def measure_quantized(self, quantized: QuantizedScene) -> Quality:
         """Quality of codes that are dequantized on the device."""
-        return self._compare(lambda: self._context.renderer.load_quantized(quantized))
+        return self._compare(lambda: self._renderer.load_quantized(quantized))
 
     def _compare(self, load: Callable[[], DeviceScene]) -> Quality:
         """Quality of what `load` brings to the device, over the views that report and (fidelity only) some training poses."""

@@ -19,12 +19,12 @@ from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, lone_b
 from flexgs_edge.quality.ssim import ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.few_poses import FewPoses
 from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.render_context import RenderContext
 
 SHARE = 4
 """Reference images take at most one part in `SHARE` of the free budget. The scene and its views need the rest."""
@@ -54,7 +54,7 @@ class QualityEvaluator:
 
     def __init__(
         self,
-        context: RenderContext,  # Draws both scenes. Kept images take at most a quarter of its free budget.
+        renderer: Renderer,  # Draws both scenes. Kept images take at most a quarter of its free budget.
         source: SceneSource,  # The original. A reference that was not kept is drawn again.
         views: ViewSet,  # all views of the run
         indices: Sequence[int],  # the views to compare
@@ -63,8 +63,8 @@ class QualityEvaluator:
         base_psnr: float | None = None,
         reports: bool = False,
     ) -> None:
-        self.context, self.renderer = context, context.renderer
-        budget = context.renderer.budget
+        self.renderer = renderer
+        budget = renderer.budget
         self.source = source
         self.cameras = views.of(indices)
         self.photos = views.photos if with_photos else None
@@ -205,7 +205,7 @@ class QualityEvaluator:
             return known
         ssims, flips = self._ssims if with_ssim else None, self._flips if flip else None
         found: list[ViewQuality] = []
-        images = self.context.images(scene, self.cameras)
+        images = (self.renderer.render(scene, camera) for camera in self.renderer.in_turn(scene, self.cameras))
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
             error, similar = self._original_error[i] if self.photos is not None else None, self._original_ssim.get(i)
             original = self.original(i)

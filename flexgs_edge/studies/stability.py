@@ -23,7 +23,7 @@ from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.few_poses import evenly
 from flexgs_edge.run.inputs import load_scene
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_run
@@ -245,10 +245,10 @@ def poses(
     files = {name: load_scene(result.output or "").source for name, result in found.items()}
     rows: list[dict[str, Cell]] = []
     base: dict[str, float] = {}
-    with open_context(run) as context:
-        every = make_poses(run, context.renderer, amounts)
+    with open_renderer(run) as renderer:
+        every = make_poses(run, renderer, amounts)
         for made in progress.track(every, "poses", len(every)):
-            for name, cells in look(context.renderer, run.source, files, made.cameras).items():
+            for name, cells in look(renderer, run.source, files, made.cameras).items():
                 # Identical pictures have no finite fidelity, so nothing can be compared with them.
                 fidelity = math.inf if cells["fidelity"] is None else number(cells, "fidelity")
                 below = base.setdefault(name, fidelity) - fidelity

@@ -9,15 +9,15 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 
 
 @dataclass(frozen=True)
 class Original:
     """The original from some poses."""
 
-    context: RenderContext  # draws the views
+    renderer: Renderer  # draws the views
     origin: np.ndarray  # [3] f64, as in `SceneSource`
     cameras: Sequence[Camera]  # scored poses
     references: References  # renders of the original from `cameras`, then from `between`

@@ -16,7 +16,6 @@ from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
-from flexgs_edge.views.render_context import RenderContext
 from flexgs_edge.views.sums import ViewSums
 from kernel_fixtures import FORMS, PairedBackend, large_budget, launch, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -68,7 +67,7 @@ def everything(form: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndar
         references = [renderer.render_planes(scene, camera).astype(np.float16) for camera in views()]
     planes = source.read(slice(0, ROWS), list(FIELD))
     planes = {name: values + np.float32(0.1) if name.startswith("sh") else values for name, values in planes.items()}
-    original = Original(RenderContext(renderer), np.zeros(3), views(), references)  # type: ignore[arg-type]
+    original = Original(renderer, np.zeros(3), views(), references)  # type: ignore[arg-type]
     moved = refit_colours(planes, np.full(ROWS, 2), original, rounds=1)
     renderer.release()
     return [*found, statistics.hits, statistics.weights, moved["sh_dc"], moved["sh_rest"]], counts

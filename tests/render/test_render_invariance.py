@@ -25,7 +25,6 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import parse_size
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import ALL_FORMS, FORMS, default_device, large_budget, open_form
 from quantized_scenes import quantize_all
 from synthetic import look_from, make_camera, random_scene
@@ -176,7 +175,7 @@ def test_costs_of_a_streamed_scene() -> None:
         budget = MemoryBudget(limit)
         renderer = Renderer(OpenCLBackend(default_device(), budget, width=8), budget)
         with renderer.load(SCENE, sum_bytes(2) + cost_bytes(SCENE.sh_degree)) as scene:
-            costs = measure_costs(RenderContext(renderer), scene, cameras())
+            costs = measure_costs(renderer, scene, cameras())
             found[limit] = scene.resident, (costs.removal.tobytes(), costs.sh.tobytes(), costs.sh_mean.tobytes())
         renderer.release()
     assert [resident for resident, _ in found.values()] == [True, False, False, True]

@@ -12,7 +12,6 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs
 from flexgs_edge.render.fit import SUM_BYTES, sum_bytes
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget
 from quantized_scenes import quantize_all
 from synthetic import make_camera, random_scene
@@ -89,13 +88,13 @@ def test_a_larger_view_cuts_a_scene_anew() -> None:
 def test_sums_over_views_of_two_sizes_belong_to_the_same_chunks() -> None:
     """A scene that was cut for its first view stays cut so, although a smaller one leaves room for larger chunks."""
     room, views = cost_bytes(3) + sum_bytes(2), [LARGE, SMALL, LARGE]
-    bench = RenderContext(Renderer(TwinBackend(large_budget()), large_budget()))
-    with bench.renderer.load(SCENE, room) as scene:
-        expected = measure_costs(bench, scene, views)
+    ample = Renderer(TwinBackend(large_budget()), large_budget())
+    with ample.load(SCENE, room) as scene:
+        expected = measure_costs(ample, scene, views)
     cut = 0
     for renderer in scarce(room):
         with renderer.load(SCENE, room) as scene:
-            found = measure_costs(RenderContext(renderer), scene, views)
+            found = measure_costs(renderer, scene, views)
             cut += not scene.resident
         renderer.release()
         assert found.removal.tobytes() == expected.removal.tobytes()

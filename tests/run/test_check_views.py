@@ -16,17 +16,17 @@ from flexgs_edge.cameras.conventions import other_conventions
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import InputError
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.check_views import check_views
-from flexgs_edge.run.open_context import open_context
+from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions, ViewOptions
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.render_context import RenderContext
 
 WIDTH = 120
-Opened = tuple[Run[ViewOptions], RenderContext]
+Opened = tuple[Run[ViewOptions], Renderer]
 Load = Callable[[int], np.ndarray]
 
 
@@ -41,19 +41,19 @@ class MadePhotos:
 def opened(sample_dir: Path) -> Iterator[Opened]:
     """The bundled scene with small views."""
     run = open_run(sample_dir / "point_cloud.ply", ViewOptions(resolution=WIDTH))
-    with open_context(run) as bench:
-        yield run, bench
+    with open_renderer(run) as renderer:
+        yield run, renderer
 
 
 def checked(
     opened: Opened, cameras: list[Camera] | None = None, load: Load | None = None, trusted: bool = False
 ) -> tuple[str, ...]:
     """Warnings of the check with other cameras or photos."""
-    run, bench = opened
+    run, renderer = opened
     views = run.seen
     photos: Any = views.photos if load is None else MadePhotos(load)
     changed = replace(run, views=replace(views, cameras=cameras or views.cameras, photos=photos))
-    return check_views(changed, bench, trusted).warnings
+    return check_views(changed, renderer, trusted).warnings
 
 
 def photo(opened: Opened, index: int) -> np.ndarray:
@@ -144,18 +144,18 @@ def test_some_wrong_photos_are_a_warning(opened: Opened) -> None:
 
 
 def test_views_that_see_nothing_are_warned_of_without_photos(opened: Opened) -> None:
-    run, bench = opened
+    run, renderer = opened
     away = [replace(c, rotation=np.diag([-1.0, 1.0, -1.0]) @ c.rotation) for c in run.seen.cameras]
     far = [replace(c, translation=np.diag([-1.0, 1.0, -1.0]) @ c.translation + [0, 0, -1e6]) for c in away]
     blind = replace(run, views=replace(run.seen, cameras=far, photos=None))
     assert frame_warnings(run.seen, run.scene) == ()
     assert "nothing of the scene in sight" in frame_warnings(blind.seen, run.scene)[0]
-    (words,) = check_views(blind, bench, trusted=False).warnings
+    (words,) = check_views(blind, renderer, trusted=False).warnings
     assert "15 of 15 compared views show nothing but one colour" in words
 
 
 def test_cameras_in_matter_are_refused_without_photos(opened: Opened) -> None:
-    run, bench = opened
+    run, renderer = opened
     wall = {
         "means": np.zeros((3, 1), np.float32),
         "log_scales": np.full((3, 1), 6.0, np.float32),
@@ -165,7 +165,7 @@ def test_cameras_in_matter_are_refused_without_photos(opened: Opened) -> None:
     }
     inside = replace(run.of_source(MemorySource(wall)), views=replace(run.seen, photos=None))
     with pytest.raises(InputError, match="stand in matter"):
-        check_views(inside, bench, trusted=False)
+        check_views(inside, renderer, trusted=False)
 
 
 def test_compress_stops_and_evaluate_warns(opened: Opened, sample_dir: Path, tmp_path: Path) -> None:

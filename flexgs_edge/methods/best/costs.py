@@ -24,7 +24,6 @@ from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.scene.source import Planes
-from flexgs_edge.views.render_context import RenderContext
 from flexgs_edge.views.sums import Maker, ViewSums
 
 MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
@@ -119,7 +118,7 @@ def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
 
 
 def measure_costs(
-    context: RenderContext,  # draws the views
+    renderer: Renderer,  # draws the views
     scene: DeviceScene,  # loaded with room for the sums of this pass
     cameras: Sequence[Camera],  # the scored poses
     sh_costs: bool = True,  # Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
@@ -127,14 +126,14 @@ def measure_costs(
 ) -> RemovalCosts:
     """Measure costs in one pass, which takes about twice the time of rendering the poses."""
     degree = scene.sh_degree if sh_costs else 0
-    costs = ViewSums(context.renderer, scene, [cost_sums(context.renderer, degree)])
+    costs = ViewSums(renderer, scene, [cost_sums(renderer, degree)])
     try:
         for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
             pass
-        found = cost_parts(degree, scene.count, context.renderer.storage)
+        found = cost_parts(degree, scene.count, renderer.storage)
         for rows, (sums,) in costs.parts():
             put_costs(found, rows, sums)
-        return RemovalCosts.of([found], context.renderer.storage)
+        return RemovalCosts.of([found], renderer.storage)
     finally:
         costs.release()
 

@@ -253,7 +253,7 @@ class GridMaker:
 
     def _probe_slopes(self, snapshot: Snapshot) -> Slopes:
         original, planes = self.rounds.original, snapshot.planes
-        return probe_slopes(original.context.renderer, planes, original.origin, original.cameras, self.effort.probed)
+        return probe_slopes(original.renderer, planes, original.origin, original.cameras, self.effort.probed)
 
     def _choice(self, multiplier: float) -> tuple[Kept, StepSizes]:
         """The rows that a multiplier keeps, and the grid's step sizes."""
@@ -336,8 +336,8 @@ class GridMaker:
         """
         original = self.rounds.original
         source = MemorySource(values_of(grid, self.rounds.storage), origin=original.origin)
-        with original.context.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
-            costs = measure_costs(original.context, scene, original.cameras, sh_costs=False)
+        with original.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
+            costs = measure_costs(original.renderer, scene, original.cameras, sh_costs=False)
         return np.where(costs.weight2 > 0, costs.removal, np.inf)
 
     def _schedule(self, share: float, planes: Planes, last: float = Schedule.last, multiplier: float = 0.0) -> Schedule:

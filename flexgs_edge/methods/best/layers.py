@@ -20,9 +20,9 @@ from flexgs_edge.methods.best.memory_plan import SPILLED_ROW_BYTES
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.render_context import RenderContext
 
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
@@ -47,7 +47,7 @@ def assign_layers(
     grid: GridScene,  # the scene to sort
     parts: Sequence[float],
     bits: BitModel,  # bits that the coder takes for a row of each SH degree
-    context: RenderContext,  # draws the views
+    renderer: Renderer,  # draws the views
     cameras: Sequence[Camera],  # the scored poses
     progress: Progress = SILENT,  # told of each view
 ) -> GridScene:
@@ -60,11 +60,11 @@ def assign_layers(
     `parts`: share of the bits that stays when the last layer is cut off, then the last but one, and so on. One layer
     more than shares is made. Returns the same Gaussians in the order of their layers.
     """
-    storage = context.renderer.storage
+    storage = renderer.storage
     planes, left, layer = values_of(grid, storage), np.arange(grid.count), np.zeros(grid.count, np.uint8)
     for level, part in zip(range(len(parts), 0, -1), parts, strict=True):
         layer[left] = level
-        left = worthiest(planes, grid.sh_degrees, left, part, bits, context, cameras, grid.origin, progress)
+        left = worthiest(planes, grid.sh_degrees, left, part, bits, renderer, cameras, grid.origin, progress)
         layer[left] = 0
     order = np.argsort(layer, kind="stable")
     return replace(grid.take(order, storage), layer=layer[order])
@@ -76,7 +76,7 @@ def worthiest(
     left: np.ndarray,  # [k] i64, rows to choose from
     part: float,  # above 0, at most 1
     bits: BitModel,  # bits of a row of each SH degree
-    context: RenderContext,
+    renderer: Renderer,
     cameras: Sequence[Camera],
     origin: np.ndarray,  # [3] f64, as in `SceneSource`
     progress: Progress = SILENT,
@@ -84,10 +84,10 @@ def worthiest(
 ) -> np.ndarray:
     """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty.
 
-    `context`, `cameras`, `progress`: as for `assign_layers`. `keep`: share of the bits that stays before costs are
+    `renderer`, `cameras`, `progress`: as for `assign_layers`. `keep`: share of the bits that stays before costs are
     measured again. Default: by the number of rows.
     """
-    renderer, storage = context.renderer, context.renderer.storage
+    storage = renderer.storage
     cost = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])
     spent = cost[degrees[left]]
     end = part * spent.sum()
@@ -96,7 +96,7 @@ def worthiest(
         for rows, (scales,) in read_ahead(len(left), kept["log_scales"]):
             put_rows(kept["log_scales"], rows, scales + growth(len(left), len(degrees)))
         with renderer.load(MemorySource(kept, origin=origin), sum_bytes(2) + cost_bytes(0)) as scene:
-            costs = measure_costs(context, scene, cameras, sh_costs=False, progress=progress)
+            costs = measure_costs(renderer, scene, cameras, sh_costs=False, progress=progress)
         del kept
         worth = costs.removal / spent
         worth[costs.weight2 <= 0] = -1.0

@@ -36,6 +36,7 @@ from flexgs_edge.methods.best.search import Candidate, Maker, Product, search
 from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
@@ -48,42 +49,41 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 
 See = Callable[[Sequence[int], int], bool]
 MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
 
 
-def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
+def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 2.
 
-    `run`: planned, with views and a target. `context`: draws the views. Its renderer gets the storage that the search
-    needs. Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene
-    does not fit.
+    `run`: planned, with views and a target. `renderer`: draws the views. It gets the storage that the search needs.
+    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
+    fit.
     """
-    assert context is not None  # the plan has refused runs without views
+    assert renderer is not None  # the plan has refused runs without views
     output = run.output.path
-    with Evaluators(run, context) as judges:
-        poses = choose_poses(run, context, judges.decide)
+    with Evaluators(run, renderer) as judges:
+        poses = choose_poses(run, renderer, judges.decide)
         folder = Path(run.options.scratch or (tempfile.gettempdir() if output is None else output.parent))
-        storage = context.renderer.storage = choose_storage(run, context.renderer, poses.cameras, folder)
+        storage = renderer.storage = choose_storage(run, renderer, poses.cameras, folder)
         judges.prepare()
         kept = None
         if run.options.resume:
             with run.clock.stage("fingerprint"):
-                kept = open_checkpoint(run, context.renderer, poses.cameras, folder)
+                kept = open_checkpoint(run, renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
-        coder = GridCoder(context.renderer, settings_room(run))
+        coder = GridCoder(renderer, settings_room(run))
         maker = grid_maker(run.options, coder)
-        grid, search = search_best(maker, run, context, poses, judges.decide, checkpoint=kept)
+        grid, search = search_best(maker, run, renderer, poses, judges.decide, checkpoint=kept)
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
             with run.clock.stage("layers"):
                 parts = (HALF,) * (run.options.layers - 1)
-                grid = assign_layers(grid, parts, coder.bits(grid), context, poses.cameras, run.progress)
+                grid = assign_layers(grid, parts, coder.bits(grid), renderer, poses.cameras, run.progress)
         settings = make_settings(run, search)
-        preview = _preview(run, coder, context, poses.cameras, grid, settings)
+        preview = _preview(run, coder, renderer, poses.cameras, grid, settings)
         if output is None:
             size, quality = _tried(run, coder, grid, settings, preview, judges)
         else:
@@ -97,7 +97,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
                         f"{run.target.describe()}: with its layers and its preview the file has {size} bytes; "
                         "ask for fewer layers (--layers) or a smaller preview (--preview)"
                     )
-                quality = judges.measure(decoded(open_fgs(place), context.renderer))
+                quality = judges.measure(decoded(open_fgs(place), renderer))
             LOG.info("wrote %s, %s", output, format_size(size))
         if kept is not None:
             kept.remove()
@@ -119,7 +119,7 @@ def compress(run: Run[CompressOptions], context: RenderContext | None) -> Method
 def _preview(
     run: Run[CompressOptions],
     coder: GridCoder,
-    context: RenderContext,
+    renderer: Renderer,
     cameras: Sequence[Camera],
     grid: GridScene,
     settings: dict[str, Any],
@@ -134,7 +134,7 @@ def _preview(
     if not most:
         return b""
     with run.clock.stage("preview"):
-        preview = make_preview(grid, most, coder.bits(grid), context, cameras, settings, run.progress)
+        preview = make_preview(grid, most, coder.bits(grid), renderer, cameras, settings, run.progress)
     if preview:
         LOG.info("a preview of %s comes first", format_size(len(preview)))
     else:
@@ -173,15 +173,15 @@ def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]
     return make
 
 
-def choose_poses(run: Run[CompressOptions], context: RenderContext, judge: QualityEvaluator) -> ScoredPoses:
+def choose_poses(run: Run[CompressOptions], renderer: Renderer, judge: QualityEvaluator) -> ScoredPoses:
     """`scored_poses` for a run.
 
-    `run`: planned. `context`: its renderer has nothing loaded. `judge`: on the views that decide.
+    `run`: planned. `renderer`: with nothing loaded. `judge`: on the views that decide.
     """
     return scored_poses(
         run.seen.of(run.seen.train),
         run.options,
-        context.renderer,
+        renderer,
         run.source,
         judge.covered_decides,
         judge.cameras,
@@ -191,8 +191,8 @@ def choose_poses(run: Run[CompressOptions], context: RenderContext, judge: Quali
 
 def search_best(
     make: MakerOf[Product],  # `grid_maker`, or what makes a file of another format
-    run: Run[CompressOptions],  # Planned. The storage of `context.renderer` holds its scene as a whole.
-    context: RenderContext,  # draws the views
+    run: Run[CompressOptions],  # Planned. The storage of `renderer` holds its scene as a whole.
+    renderer: Renderer,  # draws the views
     poses: ScoredPoses,  # from `scored_poses`
     judge: QualityEvaluator,  # prepared on the views that decide
     checkpoint: Checkpoint | None = None,  # keeps the rounds for a later run (`--resume`)
@@ -202,7 +202,7 @@ def search_best(
     Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
     fit.
     """
-    source, options, renderer, target = run.source, run.options, context.renderer, run.target
+    source, options, target = run.source, run.options, run.target
     plan = MemoryPlan.of(run, renderer, poses.cameras)
     run.budget.require("a search by measured costs", plan.held + plan.least)
     run.budget.take("the scene and its search", plan.held)
@@ -227,7 +227,7 @@ def search_best(
             between = poses_between(poses.cameras) if plan.steps else ()
             turns = poses.known.slopes([*poses.cameras, *between]) if poses.known and plan.steps else None
             rounds = PruneRounds(
-                Original(context, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns),
+                Original(renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns),
                 source,
                 refit=options.refit,
                 unseen_share=options.unseen_share,

@@ -28,11 +28,11 @@ from flexgs_edge.methods.best.layers import worthiest
 from flexgs_edge.methods.best.refit.finetune import Schedule, finetune
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource, Planes
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 
 LEAST_PREVIEWED, PREVIEW_SHARE = 1_000_000, 0.02
 """Where nothing is said, files from so many bytes on get a preview, of this share of their bytes. A smaller file comes within a
@@ -53,7 +53,7 @@ def make_preview(
     grid: GridScene,  # the whole scene
     most: int,  # bytes of the preview
     bits: BitModel,  # bits of the scene's Gaussians
-    context: RenderContext,  # Draws the views. Its renderer has nothing loaded.
+    renderer: Renderer,  # draws the views; with nothing loaded
     cameras: Sequence[Camera],  # the scored poses; a part of them decides
     settings: Mapping[str, Any],  # those of the scene's file; the preview is drawn like it
     progress: Progress = SILENT,  # told of each view
@@ -61,11 +61,11 @@ def make_preview(
     """A file of at most `most` bytes, without SH; no bytes if there is no room for one."""
     if grid.count == 0:
         return b""
-    storage = context.renderer.storage
+    storage = renderer.storage
     drawn = {name: settings[name] for name in DRAWING}
     planes = values_of(grid, storage)
     with References(storage.folder) as references:
-        original = _original(planes, grid.origin, references, context, cameras, progress)
+        original = _original(planes, grid.origin, references, renderer, cameras, progress)
         small = {**planes, "sh_rest": planes["sh_rest"][:0]}
         del planes
         rows = 8 * most / bits.of_degree(0)
@@ -111,17 +111,16 @@ def _original(
     planes: Planes,
     origin: np.ndarray,
     references: References,
-    context: RenderContext,
+    renderer: Renderer,
     cameras: Sequence[Camera],
     progress: Progress,
 ) -> Original:
     """The whole scene from a part of the poses, at a part of their points."""
     some = [_coarser(camera) for camera in cameras[:: -(-len(cameras) // POSES)]]
-    renderer = context.renderer
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         for view, camera in enumerate(renderer.in_turn(scene, some)):
             references.add(view, renderer.render_planes(scene, camera))
-    return Original(context, origin, some, references, progress=progress)
+    return Original(renderer, origin, some, references, progress=progress)
 
 
 def _coarser(camera: Camera) -> Camera:
@@ -133,11 +132,11 @@ def _stage(
     planes: Planes, rows: float, original: Original, schedule: Schedule, step_sizes: StepSizes | None = None
 ) -> Planes:
     """About `rows` rows of the planes, which have no SH, as large as they have to be, and moved by a descent."""
-    context, count = original.context, planes["means"].shape[1]
+    renderer, count = original.renderer, planes["means"].shape[1]
     degrees = np.zeros(count, np.uint8)
     part, cameras = min(rows / count, 1.0), original.cameras
-    left = worthiest(planes, degrees, np.arange(count), part, BitModel(), context, cameras, original.origin, keep=KEPT)
-    kept = take_rows(planes, np.sort(left), context.renderer.storage)
+    left = worthiest(planes, degrees, np.arange(count), part, BitModel(), renderer, cameras, original.origin, keep=KEPT)
+    kept = take_rows(planes, np.sort(left), renderer.storage)
     kept["log_scales"] += growth(len(left), count)
     steps = None if step_sizes is None else holdable(_coarse(step_sizes), kept)
     return finetune(kept, degrees[left], original, schedule, steps)

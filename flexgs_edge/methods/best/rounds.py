@@ -74,7 +74,7 @@ class PruneRounds:
         checkpoint: Checkpoint | None = None,
     ) -> None:
         self.original, self.refit, self.checkpoint, self._source = original, refit, checkpoint, source
-        self.storage = original.context.renderer.storage
+        self.storage = original.renderer.storage
         self.rows, start = self._read()
         cameras = original.cameras
         count = parts_of(len(cameras))
@@ -99,7 +99,7 @@ class PruneRounds:
 
     def _begin(self, start: dict[str, np.ndarray], unseen_share: float) -> None:
         """Measure costs on the whole scene, and draw the references."""
-        original, renderer, storage = self.original, self.original.context.renderer, self.storage
+        original, renderer, storage = self.original, self.original.renderer, self.storage
         source = MemorySource(start, origin=original.origin)
         sum_bytes_a_row = sum_bytes(2) + cost_bytes(source.sh_degree)
         with renderer.load(source, sum_bytes_a_row, view_sums=2) as scene:
@@ -149,9 +149,7 @@ class PruneRounds:
     def _round(self, planes: dict[str, np.ndarray], turn: int) -> CostParts:
         """Measure costs over a part of the poses, and refit the colours of `planes`, in place, by one step."""
         source = MemorySource(planes, origin=self.original.origin)
-        with self.original.context.renderer.load(
-            source, sum_row_bytes(source.sh_degree), references=self.refit
-        ) as scene:
+        with self.original.renderer.load(source, sum_row_bytes(source.sh_degree), references=self.refit) as scene:
             views = self._views[turn]
             return self._measure_and_refit(scene, planes, views) if self.refit else self._measure(scene, views)
 
@@ -176,7 +174,7 @@ class PruneRounds:
         if self._resumed():
             return self.snapshots[-1]
         rows, planes = change()
-        renderer = self.original.context.renderer
+        renderer = self.original.renderer
         source = MemorySource(planes, origin=self.original.origin)
         with renderer.load(source, sum_bytes(2) + cost_bytes(source.sh_degree), view_sums=2) as scene:
             self._parts = [self._measure(scene, some) for some in self._views]
@@ -190,7 +188,7 @@ class PruneRounds:
         """
         if len(self._views) >= MOST_PARTS:
             return False
-        original, renderer, count = self.original, self.original.context.renderer, len(self.original.cameras)
+        original, renderer, count = self.original, self.original.renderer, len(self.original.cameras)
         planes, rows = self.snapshots[number].planes, self.snapshots[number].rows
         scored = [*original.cameras, *cameras]
         original.references.make_room(count, len(cameras))
@@ -259,9 +257,7 @@ class PruneRounds:
         return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
-        costs = ViewSums(
-            self.original.context.renderer, scene, [cost_sums(self.original.context.renderer, scene.sh_degree)]
-        )
+        costs = ViewSums(self.original.renderer, scene, [cost_sums(self.original.renderer, scene.sh_degree)])
         try:
             keep = keep and self.refit
             drawn = costs.draw("removal_sums", [self.original.cameras[view] for view in views])
@@ -278,11 +274,8 @@ class PruneRounds:
             costs.release()
 
     def _measure_and_refit(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
-        makers = [
-            cost_sums(self.original.context.renderer, scene.sh_degree, first=4),
-            normal_sums(self.original.context.renderer),
-        ]
-        both = ViewSums(self.original.context.renderer, scene, makers)
+        makers = [cost_sums(self.original.renderer, scene.sh_degree, first=4), normal_sums(self.original.renderer)]
+        both = ViewSums(self.original.renderer, scene, makers)
         # The rounds drop no SH: only a multiplier does, later.
         degrees = np.full(scene.count, 4, np.uint8)
         try:

@@ -26,6 +26,7 @@ from flexgs_edge.methods.best.method import MakerOf, See, choose_poses, search_b
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.progress import LOG
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.method_result import MethodResult
 from flexgs_edge.run.options import CompressOptions
@@ -33,27 +34,26 @@ from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource, Planes
 from flexgs_edge.units import format_size
-from flexgs_edge.views.render_context import RenderContext
 
 
-def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
+def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResult:
     """Compress a scene into a file of another program's format.
 
-    `run`: planned. `context`: draws the views.
+    `run`: planned. `renderer`: draws the views.
     """
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     # The plan has refused runs without views.
-    assert context is not None and plan is not None and plan.target is not None and format is not None
-    with Evaluators(run, context) as judges:
+    assert renderer is not None and plan is not None and plan.target is not None and format is not None
+    with Evaluators(run, renderer) as judges:
         judges.prepare()
         if options.antialiased and not format.marks_antialiased:
             LOG.warning("%s does not say that the model is antialiased: viewers must be told", format.suffix)
-        poses = choose_poses(run, context, judges.decide)
+        poses = choose_poses(run, renderer, judges.decide)
         beside = None if output is None else check_writable(output, options.force).parent
         with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
             files = Files(run, format, Path(folder))
             LOG.info("searching for %s", plan.target.describe())
-            grid, search = search_best(file_maker(options, files), run, context, poses, judges.decide)
+            grid, search = search_best(file_maker(options, files), run, renderer, poses, judges.decide)
             judges.decided()
             file = files.of(grid)
             source = read_foreign(file)

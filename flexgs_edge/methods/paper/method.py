@@ -21,6 +21,7 @@ from flexgs_edge.methods.paper.search import adapt, measure_fixed
 from flexgs_edge.packed.quantize import QuantizedScene, quantized_bytes
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
+from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import decode_bytes, read_often
 from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.foresight import drawing_bytes
@@ -30,7 +31,6 @@ from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.settings import make_settings
 from flexgs_edge.units import format_size
-from flexgs_edge.views.render_context import RenderContext
 
 RANK_ROW_BYTES = 36
 """Bytes a Gaussian of orders, ranks, numbers of rows with SH, and rows of one choice. Scores, made before, take less."""
@@ -44,18 +44,18 @@ class Ranking:
     reused: bool = False  # whether their scores came from the cache
 
 
-def compress(run: Run[CompressOptions], context: RenderContext | None) -> MethodResult:
+def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 1.
 
-    `run`: planned. `context`: draws the views; `None` for runs without views, whose rates are fixed.
+    `run`: planned. `renderer`: draws the views; `None` for runs without views, whose rates are fixed.
     """
-    if context is not None:
+    if renderer is not None:
         with run.clock.stage("open"):  # the search reads the scene for every choice that it measures
-            source = read_often(run.source, run.budget, searching_bytes(run), context.renderer.backend)
+            source = read_often(run.source, run.budget, searching_bytes(run), renderer.backend)
             run = run.of_source(source)
     run.budget.take("the order of the Gaussians", RANK_ROW_BYTES * run.source.count)
-    with nullcontext() if context is None else Evaluators(run, context) as judges:
-        ranking = _rank(run, judges, context)
+    with nullcontext() if renderer is None else Evaluators(run, renderer) as judges:
+        ranking = _rank(run, judges, renderer)
         with run.clock.stage("open"):
             has_sh = nonzero_sh(run.source)
         bits, groups = run.options.bit_spec()
@@ -99,7 +99,7 @@ def searching_bytes(run: Run[CompressOptions]) -> int:
     )
 
 
-def _rank(run: Run[CompressOptions], judges: Evaluators | None, context: RenderContext | None) -> Ranking:
+def _rank(run: Run[CompressOptions], judges: Evaluators | None, renderer: Renderer | None) -> Ranking:
     """Draw the references, and score every Gaussian unless the cache has the scores."""
     assert run.plan is not None
     scores, reused, cache = None, False, None
@@ -110,15 +110,13 @@ def _rank(run: Run[CompressOptions], judges: Evaluators | None, context: RenderC
         scores = cache.load(run.source.count)
         reused = scores is not None
         LOG.info("scores %s %s", "reused from" if reused else "will be kept in", cache.path)
-    if judges is not None and context is not None:
+    if judges is not None and renderer is not None:
         with judges.original() as original:
             if run.plan.needs_scores and scores is None:
                 cameras = run.seen.of(run.seen.train)
                 LOG.info("scoring %d Gaussians over %d training poses", run.source.count, len(cameras))
                 with run.clock.stage("score"):
-                    scores = score_scene(
-                        context.renderer, original, run.source, cameras, run.options.score, run.progress
-                    )
+                    scores = score_scene(renderer, original, run.source, cameras, run.options.score, run.progress)
     if cache is not None and scores is not None and not reused:
         cache.save(scores)
     order = np.arange(run.source.count) if scores is None else order_from_scores(scores)

@@ -28,7 +28,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import NotedSource, joined, look_from, make_camera, random_scene
 
@@ -59,16 +58,14 @@ def found_by(form: str, storage: ScratchStorage | None) -> dict[str, np.ndarray]
         assert (scene.shown is not None) == (storage is not None)
     found |= {"hits": statistics.hits, "weights": statistics.weights}
     with drawer.load(SCENE, 100) as scene, References() as references:
-        costs = measure_costs(RenderContext(drawer), scene, cameras())
+        costs = measure_costs(drawer, scene, cameras())
         found |= {name: getattr(costs, name) for name in ("removal", "weight2", "sh", "sh_mean")}
         planes = SCENE.read(slice(0, SCENE.count), list(FIELD))
         for view, camera in enumerate(cameras()):
             references.add(view, drawer.render_planes(scene, camera))
         planes["sh_dc"] = planes["sh_dc"] + np.float32(0.1)
         degrees = np.arange(SCENE.count) % 3
-        moved = refit_colours(
-            planes, degrees, Original(RenderContext(drawer), SCENE.origin, cameras(), references), 2, subsets=2
-        )
+        moved = refit_colours(planes, degrees, Original(drawer, SCENE.origin, cameras(), references), 2, subsets=2)
     drawer.release()
     return {**found, "moved": moved["sh_dc"], "rest": moved["sh_rest"]}
 
@@ -128,8 +125,8 @@ def test_sums_of_a_chunk_take_the_place_of_a_view(
             budget.limit = held + limit
             try:
                 with drawer.load(SCENE, sum_row_bytes(SCENE.sh_degree), view_sums=2) as scene:
-                    measure_costs(RenderContext(drawer), scene, views)
-                refit_colours(planes, degrees, Original(RenderContext(drawer), SCENE.origin, views, references), 1)
+                    measure_costs(drawer, scene, views)
+                refit_colours(planes, degrees, Original(drawer, SCENE.origin, views, references), 1)
                 drawn.append(limit)
             except BudgetError as error:
                 assert not drawn and "a view" in str(error)

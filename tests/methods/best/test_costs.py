@@ -25,7 +25,6 @@ from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import FORMS, default_device, large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 
@@ -154,7 +153,7 @@ def test_sample_removals_against_renders(no_ending, sample_dir: Path) -> None:  
         renderer = Renderer(backend, large_budget())
         with renderer.load(source) as scene:
             if least:
-                costs = measure_costs(RenderContext(renderer), scene, cameras, sh_costs=False).removal
+                costs = measure_costs(renderer, scene, cameras, sh_costs=False).removal
                 rows = spread_over_range(np.where(costs > 1e-8, costs, 0), 20, seed=5)
             found = compare_in_float64(renderer, scene, cameras, rows, least)
         renderer.release()
@@ -173,7 +172,7 @@ def test_sample_removals_against_renders(no_ending, sample_dir: Path) -> None:  
 def costs_of(backend: Backend, source: SceneSource, cameras: list[Camera], sh_costs: bool = True) -> RemovalCosts:
     renderer = Renderer(backend, large_budget())
     with renderer.load(source) as scene:
-        costs = measure_costs(RenderContext(renderer), scene, cameras, sh_costs)
+        costs = measure_costs(renderer, scene, cameras, sh_costs)
     renderer.release()
     return costs
 

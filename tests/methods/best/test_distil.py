@@ -38,7 +38,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project
@@ -90,7 +89,7 @@ class Workshop:
 
     @property
     def seen(self) -> Original:
-        return Original(RenderContext(self.renderer), np.zeros(3), self.cameras, self.references)
+        return Original(self.renderer, np.zeros(3), self.cameras, self.references)
 
     def rounded(self, planes: Planes) -> Planes:
         return from_grid(to_grid(planes, self.degrees, STEPS, np.zeros(3))[0])
@@ -210,7 +209,7 @@ def test_too_little_memory_is_said_and_leaves_nothing_taken(
         budget = MemoryBudget(limit)
         renderer = Renderer(TwinBackend(budget), budget)
         try:
-            original = Original(RenderContext(renderer), np.zeros(3), workshop.cameras, workshop.references)
+            original = Original(renderer, np.zeros(3), workshop.cameras, workshop.references)
             finetune(workshop.kept, workshop.degrees, original, Schedule(1))
         except BudgetError as error:
             refused.append(str(error))

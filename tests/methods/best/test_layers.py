@@ -23,7 +23,6 @@ from flexgs_edge.scene.growth import growth
 from flexgs_edge.scene.source import MemorySource, Planes
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 
@@ -46,7 +45,7 @@ def original() -> Any:
     renderer = Renderer(open_form("w16"), large_budget())
     with renderer.load(MemorySource(planes)) as loaded:
         references = References.of(renderer, loaded, CAMERAS)
-    yield Original(RenderContext(renderer), np.zeros(3), CAMERAS, references)
+    yield Original(renderer, np.zeros(3), CAMERAS, references)
     references.close()
     renderer.release()
 
@@ -68,7 +67,7 @@ def alone(planes: Planes, inside: np.ndarray) -> Planes:
 
 def error(planes: Planes, original: Original) -> float:
     """Mean squared error from the original's renders."""
-    renderer = original.context.renderer
+    renderer = original.renderer
     with renderer.load(MemorySource(scene())) as loaded:
         wanted = [renderer.render(loaded, camera) for camera in CAMERAS]
     with renderer.load(MemorySource(planes)) as loaded:
@@ -83,7 +82,7 @@ def test_rows_of_a_first_layer(original: Original) -> None:
 
     def layer(share: float) -> np.ndarray:
         found = np.zeros(COUNT, bool)
-        found[worthiest(planes, DEGREES, np.arange(COUNT), share, bits, original.context, CAMERAS, np.zeros(3))] = True
+        found[worthiest(planes, DEGREES, np.arange(COUNT), share, bits, original.renderer, CAMERAS, np.zeros(3))] = True
         return found
 
     inside = layer(0.3)
@@ -101,18 +100,17 @@ def test_sorting_takes_as_much_memory_as_it_says(tmp_path: Path, monkeypatch: py
     degrees = rng.integers(0, 4, count).astype(np.uint8)
     drawn: list[int] = []
 
-    def measured(bench: RenderContext, scene: Any, *_: Any, **__: Any) -> RemovalCosts:
+    def measured(renderer: Renderer, scene: Any, *_: Any, **__: Any) -> RemovalCosts:
         drawn.append(scene)
         costs = RemovalCosts.empty(0, scene, storage)
         costs.removal[:], costs.weight2[:] = rng.random(scene), rng.random(scene) > 0.1
         return costs
 
     monkeypatch.setattr("flexgs_edge.methods.best.layers.measure_costs", measured)
-    renderer = SimpleNamespace(storage=storage, load=lambda source, _: nullcontext(source.count))
-    bench = cast(RenderContext, SimpleNamespace(renderer=renderer))
+    renderer = cast(Renderer, SimpleNamespace(storage=storage, load=lambda source, _: nullcontext(source.count)))
     tracemalloc.start()
     try:
-        left = worthiest(planes, degrees, np.arange(count), 0.1, BitModel(), bench, [], np.zeros(3))
+        left = worthiest(planes, degrees, np.arange(count), 0.1, BitModel(), renderer, [], np.zeros(3))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -20,7 +20,6 @@ from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 
@@ -87,7 +86,7 @@ class Workshop:
     ) -> Planes:
         count = planes["means"].shape[1]
         degrees = np.broadcast_to(np.asarray(degrees, np.uint8), count)
-        original = Original(RenderContext(self.renderer), np.zeros(3), self.cameras, self.references)
+        original = Original(self.renderer, np.zeros(3), self.cameras, self.references)
         return refit_colours(planes, degrees, original, rounds, bands, subsets)
 
 

@@ -16,7 +16,6 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 
@@ -32,7 +31,7 @@ def open_rounds(storage: Storage, refit: bool = True) -> Iterator[PruneRounds]:
     renderer = Renderer(open_form("w16"), large_budget())
     renderer.storage = storage
     with References() as references:
-        original = Original(RenderContext(renderer), SCENE.origin, CAMERAS, references)
+        original = Original(renderer, SCENE.origin, CAMERAS, references)
         yield PruneRounds(original, SCENE, refit=refit)
     renderer.release()
 

@@ -48,8 +48,8 @@ def refit_colours(
     round, each from an interleaved part of the poses (ordered subsets: Hudson & Larkin 1994). Default: 1. Returns the
     planes, with new arrays of what has moved.
     """
-    context, cameras = original.context, original.cameras
-    renderer, storage = context.renderer, context.renderer.storage
+    renderer, cameras = original.renderer, original.cameras
+    storage = renderer.storage
     fields = ("sh_dc", "sh_rest") if bands else ("sh_dc",)
     planes = {**planes, **{name: storage.copy(planes[name]) for name in fields}}
     thinned = max(len(cameras) // ROUND_VIEWS, 1)

@@ -114,7 +114,7 @@ def finetune(
     cameras = original.poses
     rates = {**rates_for(cameras, schedule.means_rate), **(rates or {})}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    renderer, storage = original.context.renderer, original.context.renderer.storage
+    renderer, storage = original.renderer, original.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.
     rows = np.argsort(degrees == 0, kind="stable")
     ordered, degrees = _canonical(planes, rows, storage), degrees[rows]

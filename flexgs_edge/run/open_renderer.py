@@ -1,4 +1,4 @@
-"""Open the context of a run: backend and renderer."""
+"""Open the renderer of a run."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from flexgs_edge.run.foresight import foresee
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.spent import run_info
-from flexgs_edge.views.render_context import RenderContext
 
 
-def open_context(run: Run[Any], needed: Callable[[], int] | None = None, compares: bool = True) -> RenderContext:
-    """Open the renderer. Close the context when done.
+def open_renderer(run: Run[Any], needed: Callable[[], int] | None = None, compares: bool = True) -> Renderer:
+    """Open the device and the renderer. Close the renderer when done.
 
     With `needed`, errors about the memory limit name one that is enough for the whole run: see `foresee`.
 
@@ -31,20 +30,20 @@ def open_context(run: Run[Any], needed: Callable[[], int] | None = None, compare
         with run.clock.stage("open"):
             foresee(run, False, needed, compares)
     backend = counted_backend(options.device, run.budget, run.clock)
-    context = RenderContext(Renderer(backend, run.budget, *drawing))
+    renderer = Renderer(backend, run.budget, *drawing)
     if needed is not None:
         foresee(run, True, needed, compares)
     try:
         if run.reporter is not None and run.views is not None:
             run.reporter.reserve(run.budget, run.views)
     except BaseException:
-        context.close()
+        renderer.close()
         raise
-    return context
+    return renderer
 
 
-def context_info(run: Run[Any], context: RenderContext | None) -> RunInfo:
+def drawn_info(run: Run[Any], renderer: Renderer | None) -> RunInfo:
     """Record seconds, memory and device of a run that draws. Files never store this record: their bytes would change."""
-    if context is None:
+    if renderer is None:
         return run_info(run.budget, run.clock)
-    return run_info(run.budget, run.clock, context.renderer.backend, context.renderer.storage)
+    return run_info(run.budget, run.clock, renderer.backend, renderer.storage)
