@@ -21,7 +21,7 @@ from synthetic import random_scene
 
 SLOPES = Slopes(dict.fromkeys(GEOMETRY, 100.0))
 UNIT = choose_steps(SLOPES, np.ones(1), np.zeros(1), 0, 1.0).opacity
-EFFORT = Effort(keep=0.8, refit_rounds=1, subsets=2, close=0.03, few=8, views=8, pixels=24, refitted=0.61)
+EFFORT = Effort(keep=0.8, refit_rounds=1, subsets=2, close=0.03, near=0.02, few=8, views=8, pixels=24, refitted=0.61)
 AT = 1e-4
 """The multiplier whose bits are worth as much as the cheaper Gaussians."""
 

@@ -48,6 +48,7 @@ class Effort:
     # `LARGEST_STEP`, and fewer if the poses have fewer pixels. More take longer, fewer make files larger:
     # docs/results/tuning.md#pixels
     pixels: int
+    near: float  # A candidate whose log of the largest share is no farther than this below 0 loses no more Gaussians
     # Expected loss after the first round of the colour refit, divided by the loss before it, until a candidate tells.
     # The fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
     # makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
@@ -125,6 +126,7 @@ _BALANCED = Effort(
     refit_rounds=2,
     subsets=7,
     close=0.13,
+    near=0.02,
     few=400,
     views=400,
     pixels=24,
@@ -135,7 +137,7 @@ _BALANCED = Effort(
 )
 EFFORTS = {
     "fast": Effort(
-        keep=0.77, refit_rounds=0, subsets=7, close=0.3, few=32, views=96, pixels=12, refitted=0.93, probed=4
+        keep=0.77, refit_rounds=0, subsets=7, close=0.3, near=0.1, few=32, views=96, pixels=12, refitted=0.93, probed=4
     ),
     "balanced": _BALANCED,
     "max": _BALANCED,  # another word: more work gained less than a tenth on most scenes

@@ -20,7 +20,7 @@ from flexgs_edge.methods.best.allocation import BitModel, choose
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
-from flexgs_edge.methods.best.landing import NEAR_QUALITY, REACH, land, land_on_quality
+from flexgs_edge.methods.best.landing import REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.finetune import Schedule, finetune, share_of_margin, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
@@ -184,7 +184,7 @@ class GridMaker:
         self.rounds.let_go()  # this goes back to none of them
         best = chosen, product
         found = excesses(target, chosen.size, chosen.measurement)
-        if most < 1 or max(found) >= -NEAR_QUALITY:
+        if most < 1 or max(found) >= -self.effort.near:
             return best
 
         def attempt(smaller: GridScene) -> list[float]:
