@@ -38,9 +38,7 @@ class FakeRounds:
         removal = rng.lognormal(math.log(scale * AT * 50), 3, count) * (weight2 > 0)
         sh = rng.lognormal(math.log(scale * AT * 10), 2, (degree, count)) * (weight2 > 0)
         costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
-        self.original = SimpleNamespace(
-            origin=np.zeros(3), cameras=range(10), context=SimpleNamespace(renderer=None), turns=None
-        )
+        self.original = SimpleNamespace(origin=np.zeros(3), cameras=range(10), renderer=None, turns=None)
         self.snapshots = [Snapshot(np.arange(count), planes, costs)]
         self.shares: list[float] = []
 
@@ -61,6 +59,9 @@ class FakeRounds:
         c, keep = self.snapshots[0].costs, rows
         costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
         self.snapshots.append(Snapshot(rows, planes, costs))
+
+    def undo(self) -> None:
+        self.snapshots.pop()
 
 
 class KnownMaker(GridMaker):

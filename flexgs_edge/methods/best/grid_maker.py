@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -72,12 +73,12 @@ def fits(most: int) -> list[float]:
     return [MOST_FIT * (LEAST_FIT / MOST_FIT) ** (k / max(count - 1, 1)) for k in range(count)]
 
 
-def rate_from(fidelity: float | None) -> float:
+def rate_from(fidelity: float) -> float:
     """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
 
     With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
     """
-    return 1.0 if fidelity is None else max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
+    return max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,7 @@ class Descents:
         """Steps of the descent to a candidate for each scored pose."""
         return self.steps / self.poses
 
-    def schedule(
-        self, share: float, fidelity: float | None, last: float = Schedule.last, multiplier: float = 0.0
-    ) -> Schedule:
+    def schedule(self, share: float, fidelity: float, last: float = Schedule.last, multiplier: float = 0.0) -> Schedule:
         """A descent with `share` of a candidate's steps, from planes of this fidelity."""
         rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
         return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier)
@@ -216,11 +215,21 @@ class GridMaker:
         """Grids go by themselves."""
 
     def _interleave(self, target: Target) -> None:
-        """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for."""
+        """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for.
+
+        Where a descent makes the views that decide worse, colours are refitted instead, also those of all candidates.
+        """
         by_size, after = target.limit_bytes is not None, -math.inf
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
             self._guess.prune(self.selection, target, INTERLEAVE_AT, fit)
-            self.rounds.renew(self._cut_and_descend)
+            kept = self.selection.kept(self.selection.cut())  # half a round more
+            pruned = self._fidelity(kept.planes)
+            schedule = self._descents.schedule(INTERLEAVED_SHARE, pruned, last=INTERLEAVED_LAST)
+            self.rounds.renew(partial(self._off_grid, kept, schedule))
+            if self._fidelity(self.selection.last.planes) < pruned:
+                self.rounds.undo()
+                self.steps, self.selection.begin = 0, 0
+                break
             before = after
             if not by_size:
                 planes = self.selection.last.planes
@@ -232,11 +241,14 @@ class GridMaker:
             if min(before, after) >= math.log(INTERLEAVE_TO):
                 break
 
-    def _cut_and_descend(self) -> tuple[np.ndarray, Planes]:
-        """Rows and planes after a cut by half a round and a descent off the grid."""
-        kept = self.selection.kept(self.selection.cut())
-        schedule = self._schedule(INTERLEAVED_SHARE, kept.planes, last=INTERLEAVED_LAST)
+    def _off_grid(self, kept: Kept, schedule: Schedule) -> tuple[np.ndarray, Planes]:
+        """Rows and planes after a descent off the grid."""
         return kept.rows, self._finetune(kept, schedule)
+
+    def _fidelity(self, planes: Planes) -> float:
+        """Fidelity of the views that decide, in dB; infinite if all are identical."""
+        fidelity = self.measure(planes, estimate=True).figure("fidelity")
+        return math.inf if fidelity is None else fidelity
 
     def _after(self, excess: float) -> float:
         """Expected excess of a candidate after its refit or descent, from that before it."""
@@ -275,7 +287,9 @@ class GridMaker:
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
         worth = 0.0 if self._fixed_rows else multiplier
-        moved = self._finetune(kept, self._schedule(1.0, kept.planes, multiplier=worth), step_sizes)
+        moved = self._finetune(
+            kept, self._descents.schedule(1.0, self._fidelity(kept.planes), multiplier=worth), step_sizes
+        )
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -339,11 +353,6 @@ class GridMaker:
         with original.renderer.load(source, sum_bytes(2) + cost_bytes(0), view_sums=2) as scene:
             costs = measure_costs(original.renderer, scene, original.cameras, sh_costs=False)
         return np.where(costs.weight2 > 0, costs.removal, np.inf)
-
-    def _schedule(self, share: float, planes: Planes, last: float = Schedule.last, multiplier: float = 0.0) -> Schedule:
-        """A descent from these planes with `share` of a candidate's steps."""
-        fidelity = self.measure(planes, estimate=True).figure("fidelity")
-        return self._descents.schedule(share, fidelity, last, multiplier)
 
     @property
     def _descents(self) -> Descents:

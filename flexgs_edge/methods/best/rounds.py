@@ -180,6 +180,17 @@ class PruneRounds:
             self._parts = [self._measure(scene, some) for some in self._views]
         return self._add(Snapshot(rows, planes, RemovalCosts.of(self._parts, self.storage)))
 
+    def undo(self) -> None:
+        """Drop the last snapshot, and go on from the one before it, with costs measured anew.
+
+        A checkpoint keeps no further rounds: a resumed run comes here by those that it has.
+        """
+        self.checkpoint = None
+        self._renewed.discard(len(self.snapshots) - 1)
+        self.snapshots.pop()
+        before = self.snapshots.pop()
+        self.renew(lambda: (before.rows, before.planes))
+
     def see(self, cameras: Sequence[Camera], number: int, known: KnownErrors | None) -> bool:
         """Score further poses, too, from snapshot `number` on; later ones are dropped. False if there are sets enough.
 

@@ -8,10 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
 from flexgs_edge.methods.best.costs import Snapshot
-from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds
+from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds, take_rows
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.original import Original
@@ -68,6 +69,21 @@ def test_planes_in_files_are_let_go_and_made_again_with_the_same_bits(compact: N
             assert [snapshot.held for snapshot in found] == [number == 4 for number in range(len(held))]
             assert all(snapshot.held for snapshot in expected.snapshots)
             np.testing.assert_array_equal(found[3].planes["sh_dc"], expected.snapshots[3].planes["sh_dc"])
+
+
+@pytest.mark.parametrize("spills", [False, True])
+def test_a_round_that_is_undone_leaves_those_before_it(compact: None, tmp_path: Path, spills: bool) -> None:
+    storage = ScratchStorage(tmp_path, least=0) if spills else IN_MEMORY
+    with open_rounds(storage) as rounds:
+        first, second = rounds.descend(0.8), rounds.descend(0.8)
+        planes = {name: values.copy() for name, values in second.planes.items()}
+        rounds.renew(lambda: (first.rows[::2], take_rows(first.planes, np.arange(0, first.count, 2), storage)))
+        rounds.undo()
+        assert len(rounds.snapshots) == 3
+        for name, values in planes.items():
+            np.testing.assert_array_equal(rounds.snapshots[2].planes[name], values, err_msg=name)
+        np.testing.assert_array_equal(rounds.snapshots[2].rows, second.rows)
+        assert rounds.descend(0.5).count == second.count // 2
 
 
 def test_rounds_that_have_ended_keep_no_files(compact: None, tmp_path: Path) -> None:
