@@ -104,8 +104,8 @@ def test_scores_are_those_of_the_way_of_drawing(model: Path, tmp_path: Path) -> 
     scores = {}
     for antialiased in (None, True, False):
         path = tmp_path / f"{antialiased}.npz"
-        fixed: dict[str, Any] = {"method": "paper", "prune_rate": 0.0, "sh_rate": 0.0, "images": "none", **COMMON}
-        compress(model, tmp_path / "a.fgs", antialiased=antialiased, score_cache=str(path), **fixed)
+        fixed: dict[str, Any] = {"method": "paper", "prune_rate": 0.5, "sh_rate": 0.0, "images": "none", **COMMON}
+        compress(model, tmp_path / f"{antialiased}.fgs", antialiased=antialiased, score_cache=str(path), **fixed)
         scores[antialiased] = np.load(path)["scores"]
     assert np.array_equal(scores[None], scores[True])
     assert (

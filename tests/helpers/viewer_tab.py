@@ -59,11 +59,13 @@ def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
 
 
 def until(tab: Tab, condition: str) -> None:
-    for _ in range(600):
+    for _ in range(1800):
         if tab.run(f"Boolean({condition})"):
             return
         time.sleep(0.1)
-    raise AssertionError(f"not within a minute: {condition}; {tab.run('document.body.innerText')!r}, {faults(tab)}")
+    raise AssertionError(
+        f"not within three minutes: {condition}; {tab.run('document.body.innerText')!r}, {faults(tab)}"
+    )
 
 
 def faults(tab: Tab) -> list[str]:
