@@ -22,7 +22,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
 from flexgs_edge.views.references import References
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, count, draw, large_budget, open_form, same_bits
 from reference_renderer import Reference
 from synthetic import look_from, make_camera, random_scene
@@ -124,7 +123,7 @@ def test_sums_stop_at_the_end_of_64_bits(form: str) -> None:
     renderer = Renderer(backend, large_budget())
     camera = EXTREMES["colours of +-1e6"].camera
     with renderer.load(source) as scene:
-        costs = measure_costs(RenderContext(renderer), scene, [camera] * 3)
+        costs = measure_costs(renderer, scene, [camera] * 3)
     renderer.release()
     seen = costs.weight2 > 0
     assert np.median(costs.removal[seen]) > 2.0**20 and (costs.removal[seen] > 0).all()
@@ -140,11 +139,9 @@ def test_a_row_at_the_camera_leaves_no_trace(form: str) -> None:
     source, cameras = MemorySource(arrays, 2), [make_camera(33, 20)] * 2
     renderer = Renderer(PairedBackend(open_form(form), 3), large_budget())
     with renderer.load(source) as scene, References.of(renderer, scene, cameras) as references:
-        costs = measure_costs(RenderContext(renderer), scene, cameras)
+        costs = measure_costs(renderer, scene, cameras)
         planes = {**arrays, "sh_dc": arrays["sh_dc"] / 2}
-        refitted = refit_colours(
-            planes, np.full(16, 2), Original(RenderContext(renderer), np.zeros(3), cameras, references), rounds=2
-        )
+        refitted = refit_colours(planes, np.full(16, 2), Original(renderer, np.zeros(3), cameras, references), rounds=2)
     renderer.release()
     assert costs.weight2[3] == 0 and not costs.sh[:, 3].any() and not costs.sh_mean[:, :, 3].any()
     assert (costs.weight2 > 0).sum() > 5
@@ -204,7 +201,7 @@ def test_any_rows(
         references.add(0, image[:, ::-1] / 3)
         sums = renderer.residual_and_removal_sums(scene, camera, references[0])
         assert (renderer.read_sums(sums, 6, source.count)[[0, 4, 5]] >= 0).all()
-        costs = measure_costs(RenderContext(renderer), scene, [camera] * 2)
+        costs = measure_costs(renderer, scene, [camera] * 2)
     renderer.release()
     for values in (costs.removal, costs.weight2, costs.sh):
         assert np.isfinite(values).all() and (values >= 0).all()

@@ -18,7 +18,6 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.original import Original
-from flexgs_edge.views.render_context import RenderContext
 from kernel_fixtures import (
     FORMS,
     PairedBackend,
@@ -194,11 +193,11 @@ def test_moments_of_sh(form: str, degree: int, rows: int, monkeypatch: pytest.Mo
     source = random_scene(rows, 20, degree, size=-1.5)
     renderer = Renderer(paired, large_budget())
     with renderer.load(source) as scene:
-        costs = measure_costs(RenderContext(renderer), scene, views)
+        costs = measure_costs(renderer, scene, views)
     assert costs.sh.shape == (degree, rows) and costs.sh.any()
     planes = source.read(slice(0, rows), list(FIELD))
     references = [padded_target(camera, degree) for camera in views]
-    original = Original(RenderContext(renderer), np.zeros(3), views, references)  # type: ignore[arg-type]
+    original = Original(renderer, np.zeros(3), views, references)  # type: ignore[arg-type]
     refit_colours(planes, np.full(rows, degree), original, rounds=1)
     renderer.release()
     assert paired.launched["add_costs"] and paired.launched["sh_residual"]

@@ -36,7 +36,6 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.views.original import Original
-from flexgs_edge.views.render_context import RenderContext
 from grid_scenes import STEPS, make_grid
 from kernel_fixtures import default_device, large_budget, same_bits
 from quantized_scenes import quantize_all
@@ -103,7 +102,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
     """
     source = random_scene(64, 4, 4, size=-2)
     with drawer.load(source) as scene:
-        costs = measure_costs(RenderContext(drawer), scene, [camera])
+        costs = measure_costs(drawer, scene, [camera])
         yield costs.removal
         yield costs.sh
         references: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
@@ -111,7 +110,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield drawer.read_sums(sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(
-        planes, np.full(source.count, 4), Original(RenderContext(drawer), source.origin, [camera], references), rounds=1
+        planes, np.full(source.count, 4), Original(drawer, source.origin, [camera], references), rounds=1
     )
     yield planes["sh_dc"]
     yield planes["sh_rest"]
