@@ -16,13 +16,8 @@ KERNEL_DIR_VARIABLE = "FLEXGS_KERNEL_DIR"
 """Environment variable with another kernel folder. Tests plant faults in a copy, and expect checks to notice."""
 
 _COMMON = "common.clh"
-_SHARED = (
-    _COMMON,
-    "sh.clh",
-    "activate.clh",
-    "values.clh",
-    "spans.clh",
-)  # Files of helpers that come before every kernel file
+# Files of helpers that come before every kernel file
+_SHARED = (_COMMON, "sh.clh", "activate.clh", "values.clh", "spans.clh")
 _TOGETHER = ("activate.cl", "project.cl", "sort.cl", "score.cl", "similarity.cl", "flip.cl")
 _CODEC = ("chunk_streams.clh", "chunk_passes.clh", "code_chunks.cl", "encode_chunks.cl")
 """Files that together make one program of the codec."""

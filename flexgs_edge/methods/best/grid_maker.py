@@ -217,7 +217,8 @@ class GridMaker:
     def _interleave(self, target: Target) -> None:
         """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for.
 
-        Where a descent makes the views that decide worse, colours are refitted instead, also those of all candidates.
+        A descent that makes the views that decide worse is undone. If it is the first one, colours are refitted instead of
+        all further descents.
         """
         by_size, after = target.limit_bytes is not None, -math.inf
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
@@ -228,7 +229,8 @@ class GridMaker:
             self.rounds.renew(partial(self._off_grid, kept, schedule))
             if self._fidelity(self.selection.last.planes) < pruned:
                 self.rounds.undo()
-                self.steps, self.selection.begin = 0, 0
+                if self.selection.begin == 0:
+                    self.steps = 0
                 break
             before = after
             if not by_size:

@@ -144,6 +144,16 @@ def test_a_descent_that_makes_the_deciding_views_worse_is_undone(target: Target)
     assert all((snapshot.planes["opacity_logits"] < MARK).all() for snapshot in rounds.snapshots)
 
 
+def test_a_second_descent_that_is_undone_leaves_the_first() -> None:
+    rounds = FakeRounds()
+    made = Mended(rounds, effort=replace(EFFORT, interleaved=2), steps=100)
+    found = iter([30.0, 31.0, 30.0, 29.0])  # before and after each
+    made._fidelity = lambda planes: next(found)  # type: ignore[method-assign]
+    made.start(MaxDrop(1.0))
+    marked = [bool((snapshot.planes["opacity_logits"] == MARK).all()) for snapshot in rounds.snapshots]
+    assert made.steps == 100 and len(made.calls) == 2 and made.selection.begin == marked.index(True)
+
+
 @pytest.mark.parametrize("ssim", [0.001, 0.03])
 def test_the_first_candidate_aims_at_ssim_where_it_is_nearer(ssim: float) -> None:
     made = Mended(FakeRounds(), refit=False)
