@@ -248,14 +248,13 @@ def for_degree(backend: Any, budget: MemoryBudget, degree: int) -> None:
         # A sampled view, whose window is shorter than the array of its taps: who reads behind it finds no zeros.
         view = camera(66, 60, 0.3, 1.5).every(2)
     drawer = Renderer(backend, budget, antialiased=degree == 2, fit=Fit(pairs=PAIRS))
-    bench = drawer
     with drawer.load(source) as loaded:
-        measure_costs(bench, loaded, [view])
+        measure_costs(drawer, loaded, [view])
         image = drawer.render_planes(loaded, view)
         target: Any = (np.round(image * 16) / 16 + 0.125).astype(np.float16)
     planes, targets = source.read(slice(0, source.count), list(FIELD)), cast(Any, [target])
     degrees = np.full(source.count, degree)
-    planes = refit_colours(planes, degrees, Original(bench, source.origin, [view], targets), rounds=1)
+    planes = refit_colours(planes, degrees, Original(drawer, source.origin, [view], targets), rounds=1)
     # Short again: what comes next does not depend on all bits of the refit.
     planes = {name: short(values) for name, values in planes.items()}
     with Descent(drawer, planes, degrees, source.origin, view, 0.01) as descent:
