@@ -120,7 +120,7 @@ def decompress(
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(memory_limit)
     with clock.stage("open"):
-        scene = load_scene(input, reading=reading)
+        scene = load_scene(input, reading=replace(reading, budget=budget))
         enough = budget.used + scene.held_bytes + _writing_bytes(scene.source, format)
         budget.foreseen = lambda: enough
         budget.take("reading the scene", scene.held_bytes)

@@ -26,6 +26,7 @@ from flexgs_edge.io.ply_layout import (
     read_header,
     smoothing_of,
 )
+from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
@@ -50,12 +51,18 @@ class PlySource(SceneSource):
     the model as antialiased if it has one, or as a comment of Brush or Postshot says.
 
     `path`: the file; it must not change while the source is in use (checked at every read). `block_rows`: rows that are
-    read at a time. `name`: the path for messages. Default: `path`. Raises `InputError` if the file cannot be read.
-    Raises `FormatError` if it breaks the format or is not a Gaussian scene; the message names the header line, the
-    property or the bytes.
+    read at a time. `name`: the path for messages. Default: `path`. `reading`: its budget has room for a file that is
+    loaded as a whole. Raises `InputError` if the file cannot be read. Raises `FormatError` if it breaks the format or is
+    not a Gaussian scene; the message names the header line, the property or the bytes.
     """
 
-    def __init__(self, path: str | os.PathLike[str], block_rows: int = BLOCK_ROWS, name: str | None = None) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        block_rows: int = BLOCK_ROWS,
+        name: str | None = None,
+        reading: Reading = AS_WRITTEN,
+    ) -> None:
         self.path = Path(path)
         self.name = os.fspath(path) if name is None else name
         check_readable(self.path, self.name)
@@ -74,6 +81,7 @@ class PlySource(SceneSource):
             if header.plain:
                 self._rows = _FileRows(self.path, header, stamp, block_rows)
             else:
+                reading.require(self.name, header.whole_bytes(stamp[1]))
                 rows, behind = _load_whole(self.path, header)
                 self._rows, self.held_bytes = _ArrayRows(rows, block_rows), rows.nbytes
             if behind:
@@ -290,10 +298,15 @@ def _load_whole(path: Path, header: PlyHeader) -> tuple[np.ndarray, int]:
         with open(path, "rb") as file:
             file.seek(header.data_offset)
             stream = _HeaderThenData(header, file)
-            rows: np.ndarray = PlyData.read(stream, mmap=False)["vertex"].data
+            whole: np.ndarray = PlyData.read(stream, mmap=False)["vertex"].data
             rest = os.fstat(file.fileno()).st_size - file.tell() if header.order else len(file.read().strip())
     except (PlyParseError, ValueError, UnicodeDecodeError, OverflowError, MemoryError) as error:
         raise FormatError(f"{header.name}: {error}") from error
+    # Copies without the lists, which take many times the bytes that they have in the file.
+    kinds = {name: whole.dtype[name] for name in whole.dtype.names or () if not whole.dtype[name].hasobject}
+    rows = np.empty(len(whole), list(kinds.items()))
+    for name in kinds:
+        rows[name] = whole[name]
     return rows, rest
 
 

@@ -39,6 +39,7 @@ _SILENT = ("nx", "ny", "nz")  # Properties of INRIA's layout without content (no
 RGB = ("red", "green", "blue")
 """8-bit colours, which nerfstudio's export has in place of `f_dc` with `--ply-color-mode rgb`."""
 _SHOWN = 8  # Most names in a message
+_LIST_BYTES = 200  # Memory that plyfile takes for a list of a row, beside the values
 PROGRAM = "flexgs-edge"  # First word of our comments
 SMOOTHING = "filter_3D"
 """Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not
@@ -129,6 +130,12 @@ class PlyHeader:
     def vertex_dtype(self) -> np.dtype:
         """One row of `vertex` in the file, for plain files."""
         return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
+
+    def whole_bytes(self, size: int) -> int:
+        """About how many bytes plyfile takes to read a file of `size` bytes as a whole."""
+        listed = sum(e.count * sum(p.length is not None for p in e.properties) for e in self.elements)
+        scalar = sum(e.count * e.row_size for e in self.elements)
+        return size + 2 * scalar + _LIST_BYTES * listed
 
     def check_size(self, size: int) -> int:
         """Compare the claims of the header with the file's `size` in bytes (exactly for binary files without lists).

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import Frame
+from flexgs_edge.memory.budget import MemoryBudget
 
 
 @dataclass(frozen=True)
@@ -18,11 +19,22 @@ class Reading:
     frame: Frame | None = None
     lod: int | None = None  # Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
     sh_degree: int | None = None  # Leave out SH above this degree. Default: keep all.
+    budget: MemoryBudget | None = None  # What a file unpacks to must fit into it. Default: it is not checked.
+    held: int = 0  # Bytes of other files that are read with this one
 
     @classmethod
     def of(cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None) -> Reading:
         """From the words of options."""
         return cls(None if frame is None else Frame(frame.strip().upper()), lod, sh_degree)
+
+    def require(self, name: str, size: int) -> None:
+        """Raise `BudgetError` unless `size` bytes fit that reading the file `name` takes."""
+        if self.budget is not None:
+            self.budget.require(f"reading {name}", self.held + size)
+
+    def beside(self, held: int) -> Reading:
+        """For one more file where others hold so many bytes."""
+        return replace(self, held=held)
 
     def __post_init__(self) -> None:
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:

@@ -24,6 +24,7 @@ QUAT_MODE = 252  # Alpha of a quaternion whose largest component is w; the next 
 _SPARE_ROWS = 1 << 20
 _ROWS_A_BYTE = 16
 """A file may hold the first number of rows, and the second for each of its bytes. Real ones need 10 to 20 bytes a row."""
+_PIXEL_BYTES = 4
 _SPARE_PIXELS = 1 << 16
 _PIXELS_A_ROW = 4
 """Pictures may hold the first number of pixels, and the second for each row: some writers round sides up."""
@@ -32,7 +33,7 @@ _PIXELS_A_ROW = 4
 def read_sog(path: Path, name: str, reading: Reading) -> SogSource:
     """Open a `.sog`; see `read_foreign`."""
     with open_zip(path, name) as archive:
-        return read_pieces(zip_pieces(archive, name, META), META, name)
+        return read_pieces(zip_pieces(archive, name, META), META, name, reading)
 
 
 def read_sog_folder(path: Path, name: str, reading: Reading) -> SogSource:
@@ -45,12 +46,12 @@ def read_sog_folder(path: Path, name: str, reading: Reading) -> SogSource:
         read[piece] = len(data)
         return data
 
-    source = read_pieces(counted, path.name, name)
+    source = read_pieces(counted, path.name, name, reading)
     source.file_bytes = sum(read.values())
     return source
 
 
-def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
+def read_pieces(pieces: Pieces, meta_name: str, name: str, reading: Reading) -> SogSource:
     """Open a scene whose pieces are given.
 
     `pieces`: gives the bytes of `meta.json` and of pictures. `meta_name`: name of the piece that names the others.
@@ -64,7 +65,24 @@ def read_pieces(pieces: Pieces, meta_name: str, name: str) -> SogSource:
         raise FormatError(
             f"{name}: {META}: {meta.count} Gaussians cannot be in pictures of {size} bytes; is the count damaged?"
         )
+    pixels = [
+        _pixels_of(piece, meta.count, f"{name}: {meta.files[key]}") for key, piece in data.items() if key != "centroids"
+    ]
+    # All pictures stay until the last is read. Pillow holds that one twice more for a moment.
+    reading.require(name, size + _PIXEL_BYTES * (sum(pixels) + 2 * max(pixels)))
     return SogSource(name, meta, data)
+
+
+def _pixels_of(data: bytes, count: int, place: str) -> int:
+    """Pixels of a picture that has one for each of `count` rows."""
+    width, height = picture_size(data, place)
+    most = _SPARE_PIXELS + _PIXELS_A_ROW * count
+    if not count <= width * height <= most:
+        raise FormatError(
+            f"{place}: expected a picture of {count} to {most} pixels, for the {count} Gaussians of {META}, found "
+            f"{width}x{height}"
+        )
+    return width * height
 
 
 class SogSource(DecodedSource):
@@ -75,10 +93,10 @@ class SogSource(DecodedSource):
     """
 
     def __init__(self, name: str, meta: SogMeta, data: dict[str, bytes]) -> None:
-        self._meta, self._data = meta, data
+        self._meta = meta
         count = meta.count
         places = {key: f"{name}: {piece}" for key, piece in meta.files.items()}
-        rows = {key: self._pixels(key, places[key]) for key in data if key != "centroids"}
+        rows = {key: read_pixels(data[key], places[key]).reshape(-1, 4)[:count] for key in data if key != "centroids"}
         self._means = rows["means_l"][:, :3] | rows["means_u"][:, :3].astype(np.uint16) << 8
         # Copies: a part of a picture would hold the whole picture.
         self._quats, self._sh0 = rows["quats"].copy(), rows["sh0"].copy()
@@ -97,20 +115,8 @@ class SogSource(DecodedSource):
             self.notes += (f"lossy pictures, so that values are not what was written: {', '.join(lossy)}",)
         self.settings = {"antialiased": True} if meta.antialiased else {}
         held = (self._means, self._quats, self._scales, self._sh0, self._palette, self._labels)
-        del self._data
         super().__init__(name, count, degree, sum(array.nbytes for array in held))
         self.version = meta.version
-
-    def _pixels(self, key: str, place: str) -> np.ndarray:
-        """[count, 4] u8, the pixels of a picture that has one for each row."""
-        count = self._meta.count
-        width, height = picture_size(self._data[key], place)
-        if not count <= width * height <= _SPARE_PIXELS + _PIXELS_A_ROW * count:
-            raise FormatError(
-                f"{place}: expected a picture of {count} to {_SPARE_PIXELS + _PIXELS_A_ROW * count} pixels, for the {count} "
-                f"Gaussians of {META}, found {width}x{height}"
-            )
-        return read_pixels(self._data[key], place).reshape(-1, 4)[:count]
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
         """See `DecodedSource.decode`."""

@@ -184,6 +184,7 @@ def _one_stream(stream: _Plain | _Gunzip, most: int, name: str, reading: Reading
     header = parse_header(name, head)
     wanted = header.count * header.row_bytes
     _check_claim(name, header, most - HEADER.size, wanted)
+    reading.require(name, wanted + _TAIL)
     data = _gathered(stream.read, wanted)
     if len(data) < wanted:
         raise FormatError(f"{name}: truncated: {_claim(header, wanted)}; found {len(data)}; is the file complete?")
@@ -221,6 +222,7 @@ def _packed_arrays(file: BinaryIO, size: int, name: str, reading: Reading) -> Sp
             f"found {place}; is the file complete?"
         )
     _check_claim(name, header, size * _MOST_PACKED, wanted)
+    reading.require(name, size + wanted)
     extensions = file.read(place - PLAIN_HEADER.size) if header.flags & EXTENDED else b""
     frame, notes = parse_extensions(name, extensions, reading.frame)
     file.seek(place)

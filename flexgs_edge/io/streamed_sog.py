@@ -6,7 +6,7 @@ The leaves of its tree name ranges of rows in SOG scenes, for each level that th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -53,13 +53,27 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
     here = cache(lambda file: is_there(path.parent, files[file], name))
     missing = [next((files[part.file] for part in level if not here(part.file)), None) for level in ranges]
     level, notes = _chosen(reading.lod, [bool(level) for level in ranges], missing, name)
-    scenes = {file: _open(path.parent, files[file], name) for file in sorted({part.file for part in ranges[level]})}
-    _check_ranges(top, ranges[level], scenes, files)
-    parts = [(scenes[part.file], part.offset, part.count) for part in ranges[level]]
+    # One file may have several names, such as a.sog and ./a.sog.
+    places = {
+        file: piece_place(path.parent, files[file], name) for file in sorted({part.file for part in ranges[level]})
+    }
+    first = {place: file for file, place in reversed(places.items())}
+    level_ranges = [replace(part, file=first[places[part.file]]) for part in ranges[level]]
+    held = 0
+
+    def opened(file: str) -> SogSource:
+        nonlocal held
+        scene = _open(path.parent, file, name, reading.beside(held))
+        held += scene.held_bytes
+        return scene
+
+    scenes = {file: opened(files[file]) for file in sorted(first.values())}
+    _check_ranges(top, level_ranges, scenes, files)
+    parts = [(scenes[part.file], part.offset, part.count) for part in level_ranges]
     if top.has("environment") and top.value["environment"] != "":
         environment = top.name("environment")
         if is_there(path.parent, environment, name):
-            scene = _open(path.parent, environment, name)
+            scene = opened(environment)
             parts.append((scene, 0, scene.count))
         else:
             notes += (f"the environment {brief(environment)} is not there: left out",)
@@ -152,14 +166,14 @@ def _chosen(asked: int | None, filled: list[bool], missing: list[str | None], na
     return level, (note,) if finer and asked is None else ()
 
 
-def _open(folder: Path, file: str, name: str) -> SogSource:
+def _open(folder: Path, file: str, name: str, reading: Reading) -> SogSource:
     """The scene behind a `meta.json`, or behind a zip, which some programs take too."""
     place, inner = piece_place(folder, file, name), f"{name}: {file}"
     if file.lower().endswith(".sog"):
-        source = read_sog(place, inner, Reading())
+        source = read_sog(place, inner, reading)
         source.file_bytes = place.stat().st_size
         return source
-    return read_sog_folder(place if place.name else place / META, inner, Reading())
+    return read_sog_folder(place if place.name else place / META, inner, reading)
 
 
 def _check_ranges(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flexgs_edge.errors import FormatError, InputError
@@ -15,6 +15,7 @@ from flexgs_edge.io.kinds import GZIP_MAGIC, Kind, kind_of
 from flexgs_edge.io.model_folder import latest_iteration
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.scene.source import SceneSource
 
 FOLDERS = ("lod-meta.json", "meta.json")  # Files that make a folder a scene, the first that is there
@@ -52,6 +53,8 @@ def open_file(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> Op
         raise InputError(
             f"{path}: --lod is for streamed scenes (lod-meta.json), and this file has one level: leave it out"
         )
+    if reading.budget is None:
+        reading = replace(reading, budget=MemoryBudget.from_limit(None))
     suffix, source = _open(place, place.name, os.fspath(place), reading)
     inner = source.parent if isinstance(source, FrameSource) else source
     size = inner.file_bytes or os.stat(place).st_size
@@ -121,7 +124,7 @@ def _open(place: Path, file_name: str, name: str, reading: Reading) -> tuple[str
         source.notes += note
         return suffix, source
     if suffix == ".ply":
-        source = in_frame(PlySource(place, name=name), reading.frame or RDF)
+        source = in_frame(PlySource(place, name=name, reading=reading), reading.frame or RDF)
         source.notes += note
         return suffix, source
     if suffix != ".fgs":

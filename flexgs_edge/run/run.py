@@ -12,6 +12,7 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Target
 from flexgs_edge.io.exchange import MovedSource, check_positions
 from flexgs_edge.io.model_folder import Companions
+from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.run.background import Colour, contrasting_background
@@ -97,11 +98,12 @@ def open_run(
         companions = _beside(path)
         if judged_path is not None:
             companions = merge_companions(companions, _beside(judged_path))
-        scene = load_scene(path, options.drop_invalid, options.reading)
-        judged = None if judged_path is None else load_scene(judged_path, options.drop_invalid)
-        for each in (scene, judged):
-            if each is not None:
-                budget.hold(each.held_bytes)
+        scene = load_scene(path, options.drop_invalid, replace(options.reading, budget=budget))
+        budget.hold(scene.held_bytes)
+        judged = None
+        if judged_path is not None:
+            judged = load_scene(judged_path, options.drop_invalid, Reading(budget=budget))
+            budget.hold(judged.held_bytes)
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos, given, budget)
