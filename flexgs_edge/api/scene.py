@@ -45,6 +45,7 @@ class Scene:
         frame: str | None = None,
         lod: int | None = None,
         sh_degree: int | None = None,
+        crop: str | None = None,
     ) -> Scene:
         """Open a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`) or a model folder.
 
@@ -61,6 +62,8 @@ class Scene:
             Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
         sh_degree : int, optional
             Leave out SH above this degree. Default: keep all.
+        crop : str, optional
+            Keep only Gaussians inside: `x,y,z,X,Y,Z`, `x,y,z,R`, or the path of a JSON file, as for `--crop`. Default: keep all.
 
         Raises
         ------
@@ -71,7 +74,7 @@ class Scene:
         """
         if not isinstance(path, (str, os.PathLike)):
             raise InputError(f"path={brief(path)}: expected a path, found {type(path).__name__}")
-        return cls(load_scene(path, drop_invalid, Reading.of(frame, lod, sh_degree)))
+        return cls(load_scene(path, drop_invalid, Reading.of(frame, lod, sh_degree, crop)))
 
     @classmethod
     def from_arrays(

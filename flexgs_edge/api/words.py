@@ -49,6 +49,7 @@ class CompressWords(TypedDict, total=False):
     frame: str | None
     lod: int | None
     sh_degree: int | None
+    crop: str | None
     memory_limit: int | None
     device: str | None
     method: str

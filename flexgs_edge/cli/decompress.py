@@ -56,6 +56,7 @@ def command(
     frame: str | None,
     lod: int | None,
     sh_degree: int | None,
+    crop: str | None,
     device: str | None,
     memory_limit: int | None,
     force: bool,
@@ -88,7 +89,7 @@ def command(
     from flexgs_edge.commands.decompress import decompress
     from flexgs_edge.io.reading import Reading, Writing
 
-    reading = Reading.of(frame, lod, sh_degree)
+    reading = Reading.of(frame, lod, sh_degree, crop)
     writing = Writing(spz_version, force_lossy=force_lossy, glb=glb, double=double)
     result = decompress(input, output, force, memory_limit, device, reading, writing, recenter, cameras)
     talk.emit(result.summary(), result.to_json(), json_path, force)

@@ -9,8 +9,9 @@ from flexgs_edge.cli import help_page, shared_options, talk
 
 @click.command(cls=help_page.SectionCommand)
 @click.argument("file", metavar="FILE", type=click.Path())
+@shared_options.crop_option
 @shared_options.write_options
-def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
+def command(file: str, crop: str | None, force: bool, json_path: str | None, quiet: bool) -> None:
     """Show what a scene file holds.
 
     For a .fgs: Gaussians, SH degree, bits and bytes of every channel, layers, settings, and the target it reached. For other
@@ -24,5 +25,5 @@ def command(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
     talk.start(quiet, json_path, force)
     from flexgs_edge.commands.info import info
 
-    found = info(file)
+    found = info(file, crop)
     talk.emit(found.summary(), found.to_json(), json_path, force)

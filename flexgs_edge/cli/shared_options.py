@@ -10,6 +10,13 @@ from flexgs_edge.cli.value_types import AXIS, COLOUR, SIZE
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DEFAULT_NEAR, MAX_VIEW_WIDTH
 
 scene_argument = click.argument("input", metavar="INPUT", type=click.Path())
+crop_option = option(
+    INPUT,
+    "--crop",
+    metavar="BOX",
+    help="Keep only Gaussians inside: x,y,z,X,Y,Z (two corners), x,y,z,R (a sphere), or a JSON file with a turned box "
+    "(docs/formats.md). World coordinates of the .ply that decompress writes. Photos are not compared then.",
+)
 reading_options = stack(
     option(
         INPUT,
@@ -32,6 +39,7 @@ reading_options = stack(
         type=int,
         help="Leave out view-dependent colour (SH) above degree N. Default: keep all.",
     ),
+    crop_option,
 )  # Options of every command that reads a scene with its values
 writing_options = stack(
     option(

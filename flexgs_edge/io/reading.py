@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
+from flexgs_edge.io.crops import parse_crop
 from flexgs_edge.io.frames import Frame
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.scene.crop import Crop
 
 
 @dataclass(frozen=True)
@@ -19,13 +21,17 @@ class Reading:
     frame: Frame | None = None
     lod: int | None = None  # Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
     sh_degree: int | None = None  # Leave out SH above this degree. Default: keep all.
+    crop: Crop | None = None  # Leave out Gaussians beyond it. Default: keep all.
     budget: MemoryBudget | None = None  # What a file unpacks to must fit into it. Default: it is not checked.
     held: int = 0  # Bytes of other files that are read with this one
 
     @classmethod
-    def of(cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None) -> Reading:
+    def of(
+        cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None, crop: str | None = None
+    ) -> Reading:
         """From the words of options."""
-        return cls(None if frame is None else Frame(frame.strip().upper()), lod, sh_degree)
+        box = None if crop is None else parse_crop(crop)
+        return cls(None if frame is None else Frame(frame.strip().upper()), lod, sh_degree, box)
 
     def require(self, name: str, size: int) -> None:
         """Raise `BudgetError` unless `size` bytes fit that reading the file `name` takes."""

@@ -43,6 +43,8 @@ class InfoResult:
     # Whether a file of another format, or its model folder, asks for antialiased drawing; `None`: neither says so.
     antialiased: bool | None = None
     format_version: int | None = None  # version of another format, if the file states one
+    # Corners of the box that holds nine tenths of the positions along each axis; `None` for a `.fgs`, whose header is read alone.
+    bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     frame: str | None = None  # directions of the axes in a file of another format, such as `RUB`; it is read into RDF
 
     @property
@@ -63,7 +65,7 @@ class InfoResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        of_other = ("cameras", "images", "antialiased", "format_version", "frame")
+        of_other = ("cameras", "images", "antialiased", "format_version", "frame", "bounds")
         of_version_2 = ("chroma", "model_bytes", "layers", "preview", "cut_from")
         if self.version is None:
             return record("info", self, "version", "channels", "settings", *of_version_2)
@@ -85,6 +87,9 @@ class InfoResult:
             )
         if any(self.origin):
             lines.append("origin:      " + ", ".join(f"{value:g}" for value in self.origin))
+        if self.bounds is not None:
+            low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in self.bounds)
+            lines.append(f"bounds:      {low} to {high} (nine tenths of the Gaussians)")
         if self.version is None:
             for word, beside in (("cameras:", self.cameras), ("images:", self.images)):
                 lines.append(f"{word:<12} {beside or 'none beside it'}")

@@ -11,6 +11,7 @@ from flexgs_edge.cameras.nerfstudio import dataparser_above
 from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import InputError
+from flexgs_edge.io.crops import crop_of
 from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions, find_companions
 from flexgs_edge.io.ply import inria_dtype
@@ -20,6 +21,7 @@ from flexgs_edge.report.run_info import SceneInfo
 from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.scene.check import check_scene
+from flexgs_edge.scene.crop import Crop, cropped
 from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.source import SceneSource
@@ -73,6 +75,7 @@ class CheckedScene:
     file_bytes: int | None = None
     frame: Frame = RDF  # directions of the axes in the file
     whole: int | None = None  # Gaussians of the scene that a cut file is a part of
+    crop: Crop | None = None  # what the scene was cropped to, now or before it was compressed
 
     @property
     def drawn(self) -> SceneSource:
@@ -101,16 +104,24 @@ def read_scene(path: str | os.PathLike[str], drop_invalid: bool = False) -> Scen
 def load_scene(path: ScenePlace, drop_invalid: bool = False, reading: Reading = AS_WRITTEN) -> CheckedScene:
     """Open a scene and check every value once. Raises `InputError` for invalid values, unless `drop_invalid` leaves them out.
 
-    A scene that is already open only loses SH above the degree that `reading` names.
+    A scene that is already open only loses what `reading` leaves out.
     """
     if isinstance(path, CheckedScene):
         if reading.frame is not None or reading.lod is not None:
             raise InputError("frame and lod say how a file is read, and this scene is open: give them to Scene.open")
-        return replace(path, source=without_degrees(path.source, reading.sh_degree))
+        return _reduced(path, reading)
     opened = open_file(path, reading)
     checked = checked_scene(opened.source, Path(path), drop_invalid)
-    source = without_degrees(checked.source, reading.sh_degree)
-    return replace(checked, source=source, file_bytes=opened.bytes, frame=opened.frame)
+    return _reduced(replace(checked, file_bytes=opened.bytes, frame=opened.frame), reading)
+
+
+def _reduced(scene: CheckedScene, reading: Reading) -> CheckedScene:
+    """Without SH above a degree, and without what lies beyond a crop: sizes are then compared with what is left."""
+    source = without_degrees(scene.source, reading.sh_degree)
+    if reading.crop is None:
+        return replace(scene, source=source)
+    source = cropped(source, reading.crop)
+    return replace(scene, source=source, input_count=source.count, file_bytes=None, crop=reading.crop)
 
 
 def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: bool = False) -> CheckedScene:
@@ -123,6 +134,7 @@ def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: b
         dict(opened.settings),
         opened.held_bytes,
         whole=opened.whole,
+        crop=None if "crop" not in opened.settings else crop_of(opened.settings["crop"], opened.name),
     )
 
 

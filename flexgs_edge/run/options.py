@@ -124,6 +124,7 @@ class ViewOptions:
     frame: str | None = None
     lod: int | None = None
     sh_degree: int | None = None
+    crop: str | None = None
     memory_limit: int | None = None
     device: str | None = None
 
@@ -147,7 +148,7 @@ class ViewOptions:
     @property
     def reading(self) -> Reading:
         """How the scene's file is read."""
-        return Reading.of(self.frame, self.lod, self.sh_degree)
+        return Reading.of(self.frame, self.lod, self.sh_degree, self.crop)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from flexgs_edge.run.inputs import (
     resolve_drawing,
 )
 from flexgs_edge.run.open_scene import is_fgs, scene_file
-from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.options import NO_PHOTOS, CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
@@ -104,9 +104,16 @@ def open_run(
         if judged_path is not None:
             judged = load_scene(judged_path, options.drop_invalid, Reading(budget=budget))
             budget.hold(judged.held_bytes)
+            if judged.crop is not None and scene.crop is None:
+                LOG.info("the original is cropped, as %s says", judged_path)
+                scene = load_scene(scene, reading=Reading(crop=judged.crop))
+        if scene.crop is not None and options.images not in (None, NO_PHOTOS):
+            raise InputError(
+                f"--images {options.images}: the scene is cropped, and photos show what lies beyond: leave --images out"
+            )
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
-        views = find_views(options, companions, scene.source, photos, given, budget)
+        views = find_views(options, companions, scene.source, photos and scene.crop is None, given, budget)
         if asked is None and views is not None:
             options, views = near_enough(options, views)
         unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))

@@ -54,6 +54,7 @@ def make_settings(
         "background": list(options.background),
         "extent": "exact",
         "antialiased": options.antialiased,
+        **({} if scene.crop is None else {"crop": scene.crop.to_json()}),
     }
 
 

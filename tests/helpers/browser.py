@@ -33,7 +33,7 @@ FLAGS: tuple[str, ...] = (
 LAUNCHER = (
     "import os, sys; os.dup2(int(sys.argv[1]), 3); os.dup2(int(sys.argv[2]), 4); os.execvp(sys.argv[3], sys.argv[3:])"
 )
-PATIENCE = 60.0
+PATIENCE = 180.0
 
 
 def find_browser() -> str | None:

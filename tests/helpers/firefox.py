@@ -27,7 +27,7 @@ PREFERENCES: dict[str, str | int | bool] = {
     "services.settings.server": "data:,none",
     "extensions.getAddons.cache.enabled": False,
 }
-PATIENCE = 60.0
+PATIENCE = 180.0
 
 
 def find_firefox() -> str | None:
