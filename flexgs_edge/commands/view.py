@@ -123,7 +123,7 @@ def _open(address: str) -> None:
 def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path]:
     """The scene as a `.fgs`: the file itself, or a temporary one of version 1, which takes no search."""
     place = scene_file(path)
-    as_it_is = run.options.frame is None and not run.options.drop_invalid
+    as_it_is = run.options.frame is None and not run.options.drop_invalid and run.options.crop is None
     if is_fgs(place) and as_it_is and run.scene.input_sh_degree == run.source.sh_degree:
         yield place
         return

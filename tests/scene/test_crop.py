@@ -15,6 +15,7 @@ from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
+from flexgs_edge.commands.view import view
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.crops import parse_crop
 from flexgs_edge.io.reading import Reading
@@ -186,6 +187,8 @@ def test_commands_work_on_what_is_inside(project: Path, tmp_path: Path) -> None:
     assert Scene.open(ply, crop=box).count == part.source.count == Scene.open(tmp_path / "part.ply").count
     against = evaluate(tmp_path / "one.fgs", ply, ViewOptions())
     assert against.quality.fidelity == pytest.approx(one.quality.fidelity, abs=0.1) and against.views.images is None
+    shown = view(tmp_path / "one.fgs", tmp_path / "page.html", ViewOptions(crop="0,0,4,0.5"))
+    assert 0 < shown.scene.count < one.count and view(tmp_path / "one.fgs", tmp_path / "all.html").size == one.size
     with pytest.raises(InputError, match="--images .*: the scene is cropped, and photos show what lies beyond"):
         compress(ply, tmp_path / "no.fgs", crop=box, images=str(project / "images"), **words)
 
