@@ -8,7 +8,7 @@ import pytest
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import ROW_BLOCK, SUM_LANES
-from flexgs_edge.methods.best.costs import PART_NAMES, cost_parts, cost_sums, put_costs
+from flexgs_edge.methods.best.costs import cost_parts, cost_sums, put_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
@@ -62,7 +62,7 @@ def everything(form: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndar
         parts = cost_parts(2, ROWS, renderer.storage)
         for rows, (costs,) in sums.parts():
             put_costs(parts, rows, costs)
-        found += [getattr(parts, name) for name in PART_NAMES]
+        found += [parts.removal, parts.weight2, parts.moments]
         sums.release()
         references = [renderer.render_planes(scene, camera).astype(np.float16) for camera in views()]
     planes = source.read(slice(0, ROWS), list(FIELD))

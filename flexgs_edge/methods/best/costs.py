@@ -7,7 +7,7 @@ Errors of Gaussians that were removed together show only in the next pass.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -26,10 +26,6 @@ from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.scene.source import Planes
 from flexgs_edge.views.sums import Maker, ViewSums
 
-MOMENT_FULL = 2.0**63 / FIXED_WEIGHT
-"""Sums of moments saturate here. Only colours of some thousands in every view reach it."""
-PART_NAMES = ("removal", "weight2", "moments")  # Arrays of `CostParts`
-
 
 @dataclass
 class RemovalCosts:
@@ -47,17 +43,19 @@ class RemovalCosts:
         """Costs over all poses, from sums that each cover a part of the poses."""
         levels, count = parts[0].moments.shape[0], len(parts[0].removal)
         costs = cls.empty(levels, count, storage)
-        for rows, found in read_ahead(count, *(getattr(part, name) for name in PART_NAMES for part in parts)):
+        for rows, found in read_ahead(
+            count, *(getattr(part, array.name) for array in fields(CostParts) for part in parts)
+        ):
             removal, weight2, moments = (
                 np.asarray(sum(found[at : at + len(parts)])) for at in range(0, len(found), len(parts))
             )
             divisor = np.where(weight2 > 0, weight2, 1.0)
             # A variance of zero may come out slightly negative by rounding.
             variance = np.maximum(moments[:, 3] - (moments[:, :3] ** 2).sum(axis=1) / divisor, 0.0)
-            # A saturated sum must not look like no variance at all.
+            # Colours of some thousands in every view saturate a sum, which must not look like no variance at all.
             put_rows(costs.removal, rows, removal)
             put_rows(costs.weight2, rows, weight2)
-            put_rows(costs.sh, rows, np.where(moments[:, 3] >= MOMENT_FULL, moments[:, 3], variance))
+            put_rows(costs.sh, rows, np.where(moments[:, 3] >= 2.0**63 / FIXED_WEIGHT, moments[:, 3], variance))
             put_rows(costs.sh_mean, rows, (moments[:, :3] / divisor).astype(np.float32))
         return costs
 
@@ -84,6 +82,12 @@ class CostParts:
     def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> CostParts:
         """The sums of some rows."""
         return CostParts(*(storage.take(values, rows) for values in (self.removal, self.weight2, self.moments)))
+
+
+def snapshot_bytes(sh_degree: int) -> int:
+    """Bytes a row of `RemovalCosts`."""
+    removal, weight2, cost, mean = 8, 8, 8, 12
+    return removal + weight2 + (cost + mean) * sh_degree
 
 
 def cost_bytes(sh_degree: int) -> int:

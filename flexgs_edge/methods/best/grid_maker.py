@@ -45,9 +45,9 @@ FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
 PRUNED_DISTILLED = 1.6
 """`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVE_AT = 0.8  # Pruning stops for a descent at this share of the loss that the target allows
-INTERLEAVE_TO = 0.8
-"""The first candidate comes once two descents in a row leave more than this share of the loss that the target allows:
+INTERLEAVED = 0.8
+"""Pruning stops for a descent at this share of the loss that the target allows, and the first candidate comes once two descents
+in a row leave more than it:
 docs/results/tuning.md#interleaved"""
 MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
@@ -55,13 +55,12 @@ many; and most descents: docs/results/tuning.md#interleaved"""
 INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
 """Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
 docs/results/tuning.md#interleaved"""
-FIXED_BITS = 2.0**-8
-"""Share of the multiplier that chooses steps where coarser ones save no bytes: so fine that only the format rounds."""
+FINE = 2.0**-8
+"""Steps as shares of others, where they shall round nothing: of colours before their refit; and of the multiplier that chooses
+steps, where the format alone rounds."""
 AGAIN_STEPS, AGAIN_RATE = 0.5, 0.25
 """Steps and rates of the descent behind colours that were clipped, as shares of those before it:
 docs/results/tuning.md#clipped"""
-FINE_COLOUR = 2.0**-8
-"""Step sizes of colours before the refit, as a share of the final ones. They are fine, so that only geometry is rounded."""
 PRICED, ABOVE = -0.035, 0.02
 """Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
 results that are too large can be trimmed: docs/results/tuning.md#landing"""
@@ -222,7 +221,7 @@ class GridMaker:
         """
         by_size, after = target.limit_bytes is not None, -math.inf
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
-            self._guess.prune(self.selection, target, INTERLEAVE_AT, fit)
+            self._guess.prune(self.selection, target, INTERLEAVED, fit)
             kept = self.selection.kept(self.selection.cut())  # half a round more
             pruned = self._fidelity(kept.planes)
             schedule = self._descents.schedule(INTERLEAVED_SHARE, pruned, last=INTERLEAVED_LAST)
@@ -240,7 +239,7 @@ class GridMaker:
                 self._left = after
             self.selection.begin = len(self.rounds.snapshots) - 1
             # One alone may leave more by chance.
-            if min(before, after) >= math.log(INTERLEAVE_TO):
+            if min(before, after) >= math.log(INTERLEAVED):
                 break
 
     def _off_grid(self, kept: Kept, schedule: Schedule) -> tuple[np.ndarray, Planes]:
@@ -276,7 +275,7 @@ class GridMaker:
         if self._slopes is None:
             # Measured once, near the answer: slopes change little between snapshots, and step sizes must not jump there.
             self._slopes = self._probe_slopes(snapshot)
-        worth = FIXED_BITS * multiplier if self._fixed_rows else multiplier
+        worth = FINE * multiplier if self._fixed_rows else multiplier
         step_sizes = choose_steps(self._slopes, kept.weight2, kept.degrees, len(snapshot.costs.sh), worth)
         count = len(kept.rows)
         kept = kept.take(reachable(step_sizes, kept.planes, kept.weight2 > 0), self.rounds.storage)
@@ -300,7 +299,7 @@ class GridMaker:
     def _finish(self, kept: Kept, step_sizes: StepSizes) -> GridScene:
         """Put geometry on its grid, refit all colours, put SH on their grid, refit the constant colour, put it on its grid."""
         storage, planes = self.rounds.storage, kept.planes
-        fine = replace(step_sizes, dc=step_sizes.dc * FINE_COLOUR, sh=tuple(s * FINE_COLOUR for s in step_sizes.sh))
+        fine = replace(step_sizes, dc=step_sizes.dc * FINE, sh=tuple(s * FINE for s in step_sizes.sh))
         grid, order = self._to_grid(planes, kept.degrees, holdable(fine, planes))
         kept.planes = planes = {}
         degrees = kept.degrees[order]

@@ -13,6 +13,7 @@ from pathlib import Path
 from flexgs_edge.cameras.camera import Camera, largest_of
 from flexgs_edge.memory.rows import READING_BYTES
 from flexgs_edge.memory.storage import IN_MEMORY, ScratchStorage, Storage
+from flexgs_edge.methods.best.costs import snapshot_bytes
 from flexgs_edge.methods.best.effort import EFFORTS, finetune_steps
 from flexgs_edge.methods.best.poses import is_fine
 from flexgs_edge.methods.best.refit.descent import descent_bytes
@@ -45,9 +46,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import format_size
 
-COST_BYTES = 16  # Bytes of a row's costs in a snapshot, without those of SH: removal and weight, in double precision
-BAND_BYTES = 20
-"""Bytes of a row's costs in a snapshot for each SH degree: a cost in double precision, and a mean colour."""
 WORK_PLANES = 11
 """Copies of its rows' planes (236 bytes a row at degree 3) that making a candidate holds for a moment. These are rows, codes,
 twice the values of codes, colours of the last refit and of this one, and twice the sums of the refit. With a
@@ -58,9 +56,6 @@ candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
 """Bytes of memory that each row of a scene in scratch files still takes for a moment: for choosing rows, and lists of rows."""
 SPOOL_ROW_BYTES = 52  # Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows
-
-USUAL_SHARE = 4
-"""Scratch files usually take one byte in so many of the most that they may take: docs/results/tuning.md#let_go"""
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:
@@ -120,9 +115,8 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     most = whole + SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
     LOG.info(
         "%d Gaussians and the rounds of their search need %s in memory, %s are free: they go to scratch files in %s "
-        "(usually about %s, at most %s; --scratch names another folder)",
-        rows, format_size(plan.held + plan.least), format_size(budget.free), storage.folder, format_size(most // USUAL_SHARE),
-        format_size(most),
+        "(at most %s; --scratch names another folder)",
+        rows, format_size(plan.held + plan.least), format_size(budget.free), storage.folder, format_size(most),
     )  # fmt: skip
     return storage
 
@@ -188,6 +182,6 @@ def row_bytes(sh_degree: int, keep: float, parts: int = PARTS) -> int:
     `parts` sets of poses come on top.
     """
     planes = stored_bytes(sh_degree)
-    snapshot = planes + COST_BYTES + BAND_BYTES * sh_degree
+    snapshot = planes + snapshot_bytes(sh_degree)
     sums = max(parts, PARTS) * 8 * (2 + 4 * sh_degree)
     return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + sums

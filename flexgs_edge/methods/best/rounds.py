@@ -7,7 +7,7 @@ the original's renders. Searches start from the snapshots that the rounds leave 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from weakref import WeakMethod
 
 import numpy as np
@@ -17,7 +17,6 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.methods.best.checkpoint import Checkpoint
 from flexgs_edge.methods.best.costs import (
-    PART_NAMES,
     CostParts,
     RemovalCosts,
     Snapshot,
@@ -222,7 +221,7 @@ class PruneRounds:
         if self.checkpoint is not None:
             arrays = [("rows", snapshot.rows), *((f"plane-{name}", values) for name, values in snapshot.planes.items())]
             for number, part in enumerate(self._parts):
-                arrays += [(f"part-{number}-{name}", getattr(part, name)) for name in PART_NAMES]
+                arrays += [(f"part-{number}-{array.name}", getattr(part, array.name)) for array in fields(part)]
             if keep_views and self.refit:
                 arrays += [(f"view-{view}", self.original.references[view]) for view in range(len(self.original.poses))]
             self.checkpoint.save(len(self.snapshots) - 1, arrays)
@@ -259,7 +258,8 @@ class PruneRounds:
         arrays = self.checkpoint.load(number, self.storage)
         planes = {name: arrays[f"plane-{name}"] for name in FIELD}
         self._parts = [
-            CostParts(*(arrays[f"part-{part}-{name}"] for name in PART_NAMES)) for part in range(len(self._views))
+            CostParts(*(arrays[f"part-{part}-{array.name}"] for array in fields(CostParts)))
+            for part in range(len(self._views))
         ]
         self._hold(Snapshot(arrays["rows"], planes, RemovalCosts.of(self._parts, self.storage)))
         if number == 0 and self.refit:

@@ -119,7 +119,7 @@ def test_descents_between_the_rounds_are_not_done_again(
     steps = 100
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
     monkeypatch.setitem(EFFORTS, "balanced", replace(EFFORTS["balanced"], interleaved=3, descends=0))
-    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVE_TO", 99.0)
+    monkeypatch.setattr("flexgs_edge.methods.best.grid_maker.INTERLEAVED", 99.0)
     words: dict[str, Any] = {**TINY, "effort": "balanced"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}

@@ -12,7 +12,7 @@ import pytest
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR, SH_C0
-from flexgs_edge.methods.best.refit.colour import RELAX_DC, refit_colours, step_colours
+from flexgs_edge.methods.best.refit.colour import refit_colours, step_colours
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
@@ -164,7 +164,7 @@ def test_faint_rows_move_as_far_as_others() -> None:
     sums = np.array([[[3.0, 0.003, 1.0], [0, 0, 1], [0, 0, 1], [30.0, 0.03, 0.0]]], np.float32)
     planes = {"sh_dc": np.zeros((3, 4), np.float32), "sh_rest": np.zeros((0, 4), np.float32)}
     step_colours(planes, np.zeros(4, np.uint8), slice(1, 4), sums)
-    step = RELAX_DC / SH_C0 * 0.1
+    step = 0.1 / SH_C0
     assert planes["sh_dc"][0].tolist() == pytest.approx([0, step, step, 0]) and not planes["sh_dc"][1:].any()
 
 

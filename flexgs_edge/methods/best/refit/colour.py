@@ -23,9 +23,8 @@ from flexgs_edge.views.original import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
 ROUND_VIEWS = 96  # Least poses of a round: docs/results/tuning.md#round_views
-RELAX_DC = 1.0
 RELAX_SH = 0.25
-"""Steps of the constant and of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
+"""Steps of SH, as shares of the SIRT step of the constant alone. All bands move at once. So a pixel seen
 by one pose moves by its residual times 1 + 15 mean |Y_k| * RELAX_SH. That factor must stay below 2, or steps from few poses
 diverge: docs/results/tuning.md#relax_sh"""
 
@@ -129,7 +128,7 @@ def step_colours(
     """
     weight = np.where(normal[:, 3] > 0, normal[:, 3], np.float32(np.inf))
     # The constant's basis is Y_0 everywhere: its step in coefficients is 1 / Y_0 of the mean residual.
-    moved = read_rows(planes["sh_dc"], rows) + np.float32(RELAX_DC / SH_C0) * normal[0, :3] / weight[0]
+    moved = read_rows(planes["sh_dc"], rows) + np.float32(1 / SH_C0) * normal[0, :3] / weight[0]
     put_rows(planes["sh_dc"], rows, moved)
     if not bands or len(normal) == 1:
         return

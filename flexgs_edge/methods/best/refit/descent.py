@@ -21,7 +21,6 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_mib
 
-PRICES = 33  # Values of the record that the kernel `descend` takes
 WIDTH = 0.5
 """Prices rise over about this many grid steps around a centre. Within a step, it makes no difference to the bits."""
 ORDER = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
@@ -33,7 +32,7 @@ WIDE = 0.055
 """A Gaussian whose largest deviation is above this share of its depth takes steps that are shorter by the same factor. Full
 steps would make haze that no scored pose sees: docs/results/tuning.md#wide"""
 PLANE_SETS = 5  # How often all planes of a chunk are held: values and their mean, gradient, two running means of it
-GRID_VALUES = 14  # Step sizes that the kernel `snap` takes
+GRID_VALUES, PRICE_VALUES = 14, 33  # Lengths of the records that the kernels `snap` and `descend` take
 
 
 def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: float) -> np.ndarray:
@@ -61,7 +60,7 @@ def bit_prices(planes: Planes, degrees: np.ndarray, steps: StepSizes, worth: flo
         counts += [away.size for away in kinds]
     # Where all values are alike they take no bits, and a small b must not make a large price of it.
     spreads = np.maximum(sums / np.maximum(counts, 1), np.array(grid) / 4)
-    prices = np.zeros(PRICES, np.float32)
+    prices = np.zeros(PRICE_VALUES, np.float32)
     prices[0 : 2 * len(grid) : 2] = worth / (math.log(2) * spreads)
     prices[1 : 2 * len(grid) : 2] = WIDTH * np.array(grid)
     prices[-len(centres) :] = centres
@@ -246,7 +245,7 @@ class Descent:
                     f"({format_mib(size)}), more than the memory limit leaves: use a larger --memory-limit, or --distil 0"
                 )
             self._scene.stay()
-            lengths = sum(self.widths.values()), GRID_VALUES, PRICES
+            lengths = sum(self.widths.values()), GRID_VALUES, PRICE_VALUES
             self._rates, self._steps, self._prices = (self._array((n,)) for n in lengths)
             for chunk in self._scene.chunks():
                 self._parts.append(self._state(chunk, planes, degrees))

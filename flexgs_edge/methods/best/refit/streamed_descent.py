@@ -20,7 +20,7 @@ from flexgs_edge.methods.best.refit.descent import (
     GRID_VALUES,
     ORDER,
     PLANE_SETS,
-    PRICES,
+    PRICE_VALUES,
     ChunkState,
     Descent,
     descent_bytes,
@@ -208,7 +208,7 @@ class StreamedDescent:
         try:
             renderer.release()
             self._scene.be_compact(fit.capacity(self.count, 1 / fit.first_share))
-            self._rates, self._prices = (self._array(n) for n in (sum(self.widths.values()), PRICES))
+            self._rates, self._prices = (self._array(n) for n in (sum(self.widths.values()), PRICE_VALUES))
             self._parts = parts_of(self._scene.spans())
             self._planes.parts = {part.base: part for part in self._parts}
             size, powers = (self._parts[-1].span.stop, self._parts[-1].powers_span.stop) if self._parts else (0, 0)
