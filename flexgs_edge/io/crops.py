@@ -64,15 +64,16 @@ def _read(path: Path) -> Any:
             return json.loads(file.read(LARGEST_FILE))
     except OSError as error:
         raise InputError(f"--crop {path}: {EXPECTED}; there is no such file ({error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"--crop {path}: not JSON ({error})") from error
 
 
 def _numbers(fields: dict[str, Any], key: str, count: int, name: str) -> np.ndarray:
     value = fields.get(key)
     values = value if isinstance(value, list) else [value]
-    good = len(values) == count and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
-    if not good or not np.isfinite(np.array(values, np.float64)).all():
+    # Comparisons, as a whole number may be too large for a float. NaN fails them too.
+    good = (isinstance(v, (int, float)) and not isinstance(v, bool) and -1e300 < v < 1e300 for v in values)
+    if len(values) != count or not all(good):
         raise InputError(f"--crop {name}: {key}: expected {count} finite numbers, found {brief(value)}")
     return np.array(values, np.float64)
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from flexgs_edge.cameras.nerfstudio import dataparser_above
 from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.crops import crop_of
 from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions, find_companions
@@ -134,8 +134,16 @@ def checked_scene(opened: SceneSource, path: Path | None = None, drop_invalid: b
         dict(opened.settings),
         opened.held_bytes,
         whole=opened.whole,
-        crop=None if "crop" not in opened.settings else crop_of(opened.settings["crop"], opened.name),
+        crop=_stored_crop(opened),
     )
+
+
+def _stored_crop(opened: SceneSource) -> Crop | None:
+    """What a `.fgs` was cropped to before it was compressed."""
+    try:
+        return crop_of(opened.settings["crop"], opened.name) if "crop" in opened.settings else None
+    except InputError as error:
+        raise FormatError(f"{opened.name}: settings in the header: {error}") from error
 
 
 def resolve_drawing(options: Options, scene: CheckedScene, companions: Companions) -> Options:

@@ -107,10 +107,10 @@ def open_run(
             if judged.crop is not None and scene.crop is None:
                 LOG.info("the original is cropped, as %s says", judged_path)
                 scene = load_scene(scene, reading=Reading(crop=judged.crop))
-        if scene.crop is not None and options.images not in (None, NO_PHOTOS):
-            raise InputError(
-                f"--images {options.images}: the scene is cropped, and photos show what lies beyond: leave --images out"
-            )
+        if scene.crop is not None:
+            if options.images not in (None, NO_PHOTOS) or (given is not None and given.images is not None):
+                raise InputError("--images: the scene is cropped, and photos show what lies beyond: leave --images out")
+            LOG.info("the scene is cropped: it is compared with its own renders, since photos show what lies beyond")
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos and scene.crop is None, given, budget)

@@ -16,11 +16,13 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.view import view
-from flexgs_edge.errors import InputError
+from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.crops import parse_crop
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.run.inputs import load_scene
+from flexgs_edge.run.inputs import checked_scene, load_scene
 from flexgs_edge.run.options import ViewOptions
+from flexgs_edge.run.run import open_run
+from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.crop import GEOMETRY, Crop, cropped
 from flexgs_edge.scene.source import MemorySource
 from synthetic import random_scene
@@ -135,6 +137,7 @@ def test_what_is_no_crop(text: str, words: str) -> None:
         ({"center": [0, 0, 0], "size": [1, 1, 1], "axes": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "at right angles"),
         ({"center": [0, 0, 0], "size": [1, 1, 1], "axes": 3}, "axes: expected three directions"),
         ({"center": [0, 0, 0], "radius": 1, "frame": "XYZ"}, "expected three letters"),
+        ({"center": [0, 0, 10**400], "radius": 1}, "center: expected 3 finite numbers"),
     ],
 )
 def test_files_that_hold_no_crop(tmp_path: Path, value: Any, words: str) -> None:
@@ -189,7 +192,7 @@ def test_commands_work_on_what_is_inside(project: Path, tmp_path: Path) -> None:
     assert against.quality.fidelity == pytest.approx(one.quality.fidelity, abs=0.1) and against.views.images is None
     shown = view(tmp_path / "one.fgs", tmp_path / "page.html", ViewOptions(crop="0,0,4,0.5"))
     assert 0 < shown.scene.count < one.count and view(tmp_path / "one.fgs", tmp_path / "all.html").size == one.size
-    with pytest.raises(InputError, match="--images .*: the scene is cropped, and photos show what lies beyond"):
+    with pytest.raises(InputError, match="--images: the scene is cropped, and photos show what lies beyond"):
         compress(ply, tmp_path / "no.fgs", crop=box, images=str(project / "images"), **words)
 
 
@@ -203,3 +206,16 @@ def test_info_counts_what_is_inside_and_shows_where_the_scene_lies(project: Path
     compress(ply, tmp_path / "a.fgs", crop=crop, effort="fast", cameras=str(project / "cameras.json"))
     assert info(tmp_path / "a.fgs").settings["crop"] == parse_crop(crop).to_json()
     assert 0 < info(tmp_path / "a.fgs", "0,0,4,0.5").count < part.count
+
+
+def test_a_damaged_crop_in_a_file_is_refused() -> None:
+    scene = random_scene(50, 2, 0)
+    scene.settings = {"crop": {"center": [0, 0, 0], "radius": -1}}
+    with pytest.raises(FormatError, match="settings in the header: .*expected a radius above 0"):
+        checked_scene(scene)
+
+
+def test_photos_from_memory_do_not_go_with_a_crop(project: Path) -> None:
+    photos = [np.zeros((4, 4, 3), np.uint8)]
+    with pytest.raises(InputError, match="--images: the scene is cropped"):
+        open_run(project / "point_cloud.ply", ViewOptions(crop="0,0,4,1"), given=GivenViews(images=photos))
