@@ -40,6 +40,7 @@ class FakeRounds:
         costs = RemovalCosts(removal, weight2, sh, np.zeros((degree, 3, count), np.float32))
         self.original = SimpleNamespace(origin=np.zeros(3), cameras=range(10), renderer=None, turns=None)
         self.snapshots = [Snapshot(np.arange(count), planes, costs)]
+        self.renewed: set[int] = set()
         self.shares: list[float] = []
 
     def descend(self, share: float) -> Snapshot:
@@ -56,6 +57,7 @@ class FakeRounds:
 
     def renew(self, change: Callable[[], tuple[np.ndarray, dict[str, np.ndarray]]]) -> None:
         rows, planes = change()
+        self.renewed.add(len(self.snapshots))
         c, keep = self.snapshots[0].costs, rows
         costs = RemovalCosts(c.removal[keep], c.weight2[keep], c.sh[:, keep], c.sh_mean[:, :, keep])
         self.snapshots.append(Snapshot(rows, planes, costs))

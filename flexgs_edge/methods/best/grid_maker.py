@@ -141,7 +141,8 @@ class GridMaker:
         self._see = see
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
-        self._guess, self._left = Guess(measure), 0.0
+        self._guess = Guess(measure)
+        self._left: dict[int, float] = {}  # Excess that the descent to a snapshot left, by the snapshot's number
 
     def start(self, target: Target) -> float:
         """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
@@ -236,7 +237,7 @@ class GridMaker:
                 planes = self.selection.last.planes
                 self._guess.learn(planes, target)
                 after = self._guess(planes, target)
-                self._left = after
+                self._left[len(self.rounds.snapshots) - 1] = after
             self.selection.begin = len(self.rounds.snapshots) - 1
             # One alone may leave more by chance.
             if min(before, after) >= math.log(INTERLEAVED):
@@ -254,7 +255,7 @@ class GridMaker:
     def _after(self, excess: float) -> float:
         """Expected excess of a candidate after its refit or descent, from that before it."""
         if self.steps:
-            return self._descents.after(excess, self._left if self.selection.begin else None)
+            return self._descents.after(excess, self._left.get(self.selection.begin))
         return excess + (math.log(self.effort.refitted) if self.refit else 0.0)
 
     def _before_refit(self, multiplier: float) -> GridScene:

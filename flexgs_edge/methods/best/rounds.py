@@ -80,7 +80,7 @@ class PruneRounds:
         self._views = [range(first, len(cameras), count) for first in range(count)]
         self._parts: list[CostParts] = []
         self.snapshots: list[Snapshot] = []
-        self._renewed: set[int] = set()  # Snapshots that a descent has made
+        self.renewed: set[int] = set()  # Snapshots that a descent has made
         if not self._resumed():
             self._begin(start, unseen_share)
         first = self.snapshots[0]
@@ -169,7 +169,7 @@ class PruneRounds:
         `change`: makes the rows ([n] i64, places in `rows`, ascending) and their planes. It is not called if a
         checkpoint has them.
         """
-        self._renewed.add(len(self.snapshots))
+        self.renewed.add(len(self.snapshots))
         if self._resumed():
             return self.snapshots[-1]
         rows, planes = change()
@@ -185,7 +185,7 @@ class PruneRounds:
         A checkpoint keeps no further rounds: a resumed run comes here by those that it has.
         """
         self.checkpoint = None
-        self._renewed.discard(len(self.snapshots) - 1)
+        self.renewed.discard(len(self.snapshots) - 1)
         self.snapshots.pop()
         before = self.snapshots.pop()
         self.renew(lambda: (before.rows, before.planes))
@@ -236,7 +236,7 @@ class PruneRounds:
         """Free the planes of all snapshots but the last `held`, and those of descents, where arrays lie in files."""
         if self.storage.spills:
             for number in range(len(self.snapshots) - held):
-                if number not in self._renewed:
+                if number not in self.renewed:
                     self.snapshots[number].let_go(self._maker(number))
 
     def _maker(self, number: int) -> Callable[[], dict[str, np.ndarray]]:

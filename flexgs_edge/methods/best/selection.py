@@ -21,7 +21,7 @@ from flexgs_edge.scene.source import Planes
 MOST_ROUNDS = 24  # Most rounds of pruning
 FEW = 16  # Of fewer Gaussians none goes in a round
 ALL_LEFT = 0.97
-"""A multiplier that keeps this share of what a descent has left asks for more: it chooses from what there was before."""
+"""A multiplier that keeps this share of what a descent has left asks for more: it chooses from what the descent before left."""
 MARGIN_FROM = 1.0
 """Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
 PRUNED_PART = 0.45
@@ -83,8 +83,8 @@ class Selection:
     def kept(self, multiplier: float) -> Kept:
         """The rows that a multiplier keeps."""
         index, keep, degrees = self._chosen(multiplier)
-        if index == self.begin > 0 and keep.mean() >= ALL_LEFT:
-            self.begin = 0
+        while index == self.begin > 0 and keep.mean() >= ALL_LEFT:
+            self.begin = max((number for number in self.rounds.renewed if number < self.begin), default=0)
             index, keep, degrees = self._chosen(multiplier)
         snapshot = self.rounds.snapshots[index]
         rows, storage = np.flatnonzero(keep), self.rounds.storage

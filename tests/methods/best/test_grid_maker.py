@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -108,12 +109,19 @@ def test_no_more_gaussians_than_allowed(target: Target) -> None:
 def test_a_multiplier_that_asks_for_more_than_descents_left_chooses_from_before() -> None:
     rounds = FakeRounds()
     selection = Mended(rounds, effort=replace(EFFORT, interleaved=1), steps=100).selection
-    some = np.arange(300)
-    rounds.renew(lambda: (some, {name: values[:, some] for name, values in rounds.snapshots[0].planes.items()}))
-    selection.begin = 1
-    few = selection.kept(AT)
-    assert len(few.rows) < ALL_LEFT * 300 and selection.begin == 1
-    assert len(selection.kept(1e-9 * AT).rows) > 300 and selection.begin == 0
+    counts = {}
+    for size in (400, 200):
+        some = np.sort(np.argsort(-rounds.snapshots[0].costs.removal, kind="stable")[:size])
+        planes = {name: values[:, some] for name, values in rounds.snapshots[0].planes.items()}
+        rounds.renew(partial(lambda rows, values: (rows, values), some, planes))
+    for power in range(24, -37, -1):  # towards more Gaussians, from those that the last descent left
+        selection.begin = 2
+        counts[power] = len(selection.kept(2.0**power * AT).rows), selection.begin
+    assert {begin for _, begin in counts.values()} == {2, 1, 0}
+    assert [begin for _, begin in counts.values()] == sorted((begin for _, begin in counts.values()), reverse=True)
+    for count, begin in counts.values():
+        assert {2: 0, 1: ALL_LEFT * 200, 0: ALL_LEFT * 400}[begin] <= count
+        assert begin == 0 or count < ALL_LEFT * {2: 200, 1: 400}[begin]
 
 
 @pytest.mark.parametrize("most", [1, 4])
