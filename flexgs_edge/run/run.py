@@ -107,6 +107,8 @@ def open_run(
             if judged.crop is not None and scene.crop is None:
                 LOG.info("the original is cropped, as %s says", judged_path)
                 scene = load_scene(scene, reading=Reading(crop=judged.crop))
+            elif judged.crop is None and scene.crop is not None:
+                judged = load_scene(judged, reading=Reading(crop=scene.crop))
         if scene.crop is not None:
             if options.images not in (None, NO_PHOTOS) or (given is not None and given.images is not None):
                 raise InputError("--images: the scene is cropped, and photos show what lies beyond: leave --images out")
