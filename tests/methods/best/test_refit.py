@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -265,8 +265,11 @@ class Interrupted(Renderer):
 
 def open_files(folder: Path) -> int:
     """Files of this process that lie in the folder, also those without a name."""
-    links = [os.path.realpath(link) for link in Path("/proc/self/fd").iterdir()]
-    return sum(link.startswith(f"{folder.resolve()}/") for link in links)
+    links = []
+    for link in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # another thread, or the listing itself, may close a file meanwhile
+            links.append(link.readlink())
+    return sum(link.is_relative_to(folder.resolve()) for link in links)
 
 
 def test_the_scratch_file_goes_when_something_fails(tmp_path: Path) -> None:
