@@ -15,8 +15,9 @@ from flexgs_edge.cli import help_page, shared_options, talk
     help_page.OUTPUT,
     "-o",
     "--output",
-    metavar="PAGE.html",
-    help="Write one file that opens from disk, without a network. Default: serve the scene until Ctrl-C.",
+    metavar="PAGE.html|FOLDER",
+    help="Write one file that opens from disk, without a network, or the folder of a web site. "
+    "Default: serve the scene until Ctrl-C.",
 )
 @help_page.option(
     help_page.OUTPUT, "--browser/--no-browser", default=True, help="Open the page in the browser. Default: open it."
@@ -51,13 +52,15 @@ def command(
     """Look at a scene in the browser.
 
     The page draws the scene as render does, and lets you turn and fly through it. Cameras are a list to choose from. Nothing is
-    loaded from elsewhere. With -o, viewer and scene become one file to mail or to keep; compress a scene first, since the page
-    holds all of its bytes.
+    loaded from elsewhere. With -o PAGE.html, viewer and scene become one file to mail or to keep; compress a scene first, since
+    the page holds all of its bytes. With -o FOLDER, they become a web site: page, scene, a picture to show until it is there, and
+    the lines that put it into another page.
 
     \b
     Examples:
       flexgs-edge view scene.fgs
       flexgs-edge view scene.fgs --cameras cameras.json -o scene.html
+      flexgs-edge view scene.fgs -o site/
       flexgs-edge view point_cloud.ply --no-browser --port 8000
     """
     progress = talk.start(quiet, json_path, force)

@@ -16,10 +16,10 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
-from flexgs_edge.run.decoding import decode_bytes, read_often
+from flexgs_edge.run.decoding import decode_bytes
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_renderer import drawn_info, open_renderer
+from flexgs_edge.run.open_renderer import drawn_info, load_drawn, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import LIBRARY_BYTES
 from flexgs_edge.run.run import open_run
@@ -57,10 +57,7 @@ def render_views(
 
     with open_renderer(run, needed=needed, compares=False) as renderer:
         run.budget.take("writing pictures", writing)
-        with clock.stage("load"):
-            source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
-            device_scene = renderer.load(run.of_source(source).scene.drawn)
-        with device_scene:
+        with load_drawn(run, renderer) as device_scene:
             started = time.perf_counter()
             with clock.stage("warm up"):
                 # Draw one view first: it builds kernels and lists, which the timed views should not pay for.

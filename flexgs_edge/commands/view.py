@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import shutil
 import tempfile
 import threading
 import webbrowser
@@ -15,29 +16,35 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.cameras.start import START, StartView
 from flexgs_edge.codec.open_fgs import file_version, read_header
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.header import Header
 from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
-from flexgs_edge.files import atomic_write, check_writable
+from flexgs_edge.files import atomic_folder, atomic_write, check_folder, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitspec import BitSpec
 from flexgs_edge.packed.quantize import far_contraction, quantize_scene
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
 from flexgs_edge.run.inputs import scene_info
+from flexgs_edge.run.open_renderer import load_drawn, open_renderer
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
+from flexgs_edge.run.reporter import encode
 from flexgs_edge.run.run import Run, open_run
+from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
-from flexgs_edge.viewer.scene_page import page_config, viewer_page
+from flexgs_edge.viewer.scene_page import page_config, site_files, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
 FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
 """Bits of a scene that is coded only to be looked at."""
-_SCENE = "viewer/scene.fgs"
+_SCENE_NAME = "scene.fgs"
+_SCENE = f"viewer/{_SCENE_NAME}"
+POSTER_SIZE, POSTER_QUALITY = (960, 540), 70  # It comes before the scene on slow networks, so it is small
 
 
 def view(
@@ -54,13 +61,17 @@ def view(
 ) -> ViewResult:
     """Look at a scene in the browser.
 
-    `input`: a scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value. `output`:
-    write a page of one file, which opens from disk without a network. Default: serve until interrupted. `host`, `port`:
+    `input`: a scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value. `output`: a name
+    that ends in .html for a page of one file, which opens from disk without a network; else a folder, for the files of a web
+    site. Default: serve until interrupted. `host`, `port`:
     where to serve. Default: this machine alone, any free port. Returns what was shown, and where.
     """
-    if output is not None:
-        if Path(output).suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"-o {output}: expected a name that ends in .html")
+    one_file = output is not None and Path(output).suffix.lower() in (".html", ".htm")
+    if output is not None and not one_file:
+        if Path(output).suffix:
+            raise InputError(f"-o {output}: expected a name that ends in .html, or a folder")
+        check_folder(output, force)
+    elif output is not None:
         check_writable(output, force)
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: expected 0 to 65535")
@@ -83,12 +94,22 @@ def view(
         kind = _kind(read_header(scene))
         files = web_files(file_version(scene), kind)
         size = os.stat(scene).st_size
-        if output is not None:
+        if one_file and output is not None:
             page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), kind).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        made = viewer_page(files, page_config(name, cameras, look, "scene.fgs"), kind=kind)
+        config = page_config(name, cameras, look, _SCENE_NAME)
+        if output is not None:
+            poster = _poster(run, StartView.stored(read_header(scene).settings))
+            site = site_files(files, config, kind, poster)
+            with atomic_folder(output, force) as folder:
+                for path, content in site.items():
+                    (folder / path).write_bytes(content)
+                shutil.copyfile(scene, folder / _SCENE_NAME)
+            total = size + sum(len(content) for content in site.values())
+            return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), total)
+        made = viewer_page(files, config, kind=kind)
         text = made.text.encode()
         resources = {PAGE: Resource("text/html; charset=utf-8", text, gzip.compress(text), made.policy)}
         resources[_SCENE] = Resource("application/octet-stream", scene)
@@ -105,6 +126,21 @@ def view(
         except KeyboardInterrupt:
             LOG.info("stopped")
         return ViewResult(scene_info(run.scene), size, len(cameras), address, None)
+
+
+def _poster(run: Run[ViewOptions], start: StartView | None) -> bytes | None:
+    """A JPEG of the start view; None without one, or without a device that draws it."""
+    if start is None:
+        return None
+    camera = start.camera(*POSTER_SIZE)
+    run = replace(run, views=ViewSet([camera], None, [0], [], START, None))
+    try:
+        with open_renderer(run) as renderer, load_drawn(run, renderer) as scene:
+            picture = renderer.render(scene, camera)
+    except (BudgetError, DeviceError) as error:
+        LOG.warning("warning: the folder has no poster, since nothing can draw it: %s", error)
+        return None
+    return encode(picture, POSTER_SIZE, POSTER_QUALITY)
 
 
 def _kind(header: Header | GridHeader) -> str:
@@ -133,5 +169,6 @@ def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path
         has_sh, contraction = nonzero_sh(source), far_contraction(source)
         rows = np.flatnonzero(has_sh), np.flatnonzero(~has_sh)
         quantized = quantize_scene(source, *rows, FINE, contraction=contraction)
-        write_container(folder / "scene.fgs", quantized, {})
+        start = run.scene.start if run.views is None else run.views.start(source)
+        write_container(folder / "scene.fgs", quantized, {} if start is None else {START: start.to_json()})
         yield folder / "scene.fgs"

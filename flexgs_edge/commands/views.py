@@ -17,10 +17,10 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import check_writable
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.report.file_results import RenderResult
-from flexgs_edge.run.decoding import decode_bytes, read_often
+from flexgs_edge.run.decoding import decode_bytes
 from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_renderer import drawn_info, open_renderer
+from flexgs_edge.run.open_renderer import drawn_info, load_drawn, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import views_info
@@ -52,10 +52,7 @@ def draw_sheet(
 
     pictures, seconds = [], []
     with open_renderer(run, needed=needed, compares=False) as renderer:
-        with clock.stage("load"):
-            source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
-            device_scene = renderer.load(run.of_source(source).scene.drawn)
-        with device_scene, clock.stage("render"):
+        with load_drawn(run, renderer) as device_scene, clock.stage("render"):
             for camera in progress.track(found.cameras, "rendering", len(found.cameras)):
                 started = time.perf_counter()
                 small = camera.scaled(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from flexgs_edge.cameras.nerfstudio import dataparser_above
 from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
+from flexgs_edge.cameras.start import StartView
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.crops import crop_of
@@ -81,6 +82,11 @@ class CheckedScene:
     def drawn(self) -> SceneSource:
         """The scene as pictures show it: what is left of a file that was cut is drawn larger."""
         return self.source if self.whole is None else GrownSource(self.source, self.whole)
+
+    @property
+    def start(self) -> StartView | None:
+        """The view to start from, which a `.fgs` may have."""
+        return StartView.stored(self.settings)
 
     @property
     def ply_bytes(self) -> int:

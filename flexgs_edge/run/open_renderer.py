@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.run_info import RunInfo
 from flexgs_edge.run.counted_backend import counted_backend
-from flexgs_edge.run.foresight import foresee
+from flexgs_edge.run.decoding import read_often
+from flexgs_edge.run.foresight import drawing_bytes, foresee
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.spent import run_info
@@ -40,6 +42,13 @@ def open_renderer(run: Run[Any], needed: Callable[[], int] | None = None, compar
         renderer.close()
         raise
     return renderer
+
+
+def load_drawn(run: Run[Any], renderer: Renderer) -> DeviceScene:
+    """Put the scene of a run on the device, to be drawn (stage `load`). Close it when done."""
+    with run.clock.stage("load"):
+        source = read_often(run.source, run.budget, drawing_bytes(run), renderer.backend)
+        return renderer.load(run.of_source(source).scene.drawn)
 
 
 def drawn_info(run: Run[Any], renderer: Renderer | None) -> RunInfo:

@@ -27,7 +27,7 @@ from flexgs_edge.run.inputs import (
     resolve_drawing,
 )
 from flexgs_edge.run.open_scene import is_fgs, scene_file
-from flexgs_edge.run.options import NO_PHOTOS, CompressOptions
+from flexgs_edge.run.options import NO_CAMERAS, NO_PHOTOS, CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
 from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
@@ -113,12 +113,23 @@ def open_run(
             if options.images not in (None, NO_PHOTOS) or (given is not None and given.images is not None):
                 raise InputError("--images: the scene is cropped, and photos show what lies beyond: leave --images out")
             LOG.info("the scene is cropped: it is compared with its own renders, since photos show what lies beyond")
+        unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
+        needless = scene.start is not None and companions.cameras is None and options.cameras is None
+        if unread and needless and options.up is None:
+            options = replace(options, cameras=NO_CAMERAS)  # the file says where to start, so no view has to be placed
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos and scene.crop is None, given, budget)
+        beside = given is None and options.cameras is None and companions.cameras is not None
+        if beside and views is not None and scene.start is not None and not scene.start.is_of(views.cameras):
+            LOG.warning(
+                "warning: %s is not used: %s was made with other cameras. If it belongs to this scene, give it by --cameras",
+                *(companions.cameras, scene.path),
+            )
+            companions = replace(companions, cameras=None, images=None)
+            views = find_views(options, companions, scene.source, False, None, budget)
         if asked is None and views is not None:
             options, views = near_enough(options, views)
-        unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
         found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from flexgs_edge._version import __version__
+from flexgs_edge.cameras.start import START
 from flexgs_edge.codec.header import canonical_json
 from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Covered, Measurement
@@ -55,6 +56,7 @@ def make_settings(
         "extent": "exact",
         "antialiased": options.antialiased,
         **({} if scene.crop is None else {"crop": scene.crop.to_json()}),
+        **({} if views is None else {START: views.start(scene.source).to_json()}),
     }
 
 

@@ -15,6 +15,7 @@ from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, spli
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.cameras.scene_sample import READ_ROWS
+from flexgs_edge.cameras.start import StartView, start_view
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.memory.budget import MemoryBudget
@@ -24,7 +25,7 @@ from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.counted_backend import counted_backend
 from flexgs_edge.run.inputs import Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scene.source import SceneSource, some_positions
 from flexgs_edge.views.sketch import sketch
 
 MEMORY = "memory"  # Takes the place of a path in records when cameras or photos came from memory
@@ -49,6 +50,16 @@ class ViewSet:
     notes: tuple[str, ...] = ()
     near: float | None = None  # largest near plane that does not cut off what automatic views show, scene units
     fits_exposure: bool = True  # photos are fitted to the exposure of the original before they are compared
+
+    def start(self, source: SceneSource) -> StartView:
+        """The view that a viewer starts from: `start_view` of all cameras, or of the better half of automatic ones.
+
+        These are in order of what they add, and the last ones show what is seldom seen.
+        """
+        if self.cameras_from != AUTO_CAMERAS:
+            return start_view(self.cameras, some_positions(source))
+        order = [*self.train, *self.held_out]
+        return start_view(self.of(order), some_positions(source), -(-len(order) // 2))
 
     def of(self, indices: Sequence[int]) -> list[Camera]:
         """The cameras at `indices`."""

@@ -10,13 +10,13 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
-LIVE = {**ENTRIES, "page": "viewer/src/live.js"}  # The same for the live scenes of a report
+LIVE = {**ENTRIES, "page": "viewer/src/live.js", "load": "viewer/src/plain-worker.js"}  # The same for the live scenes of a report
 PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
 """Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
-viewer asks for the chunks in sight first."""
+viewer asks for the chunks in sight first. The viewer of spatial scenes draws the others too; theirs are shorter."""
 _KINDS = {
-    PLAIN: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
-    SPATIAL: ("viewer/src/spatial-worker.js", "viewer/src/scene-viewer-spatial.js"),
+    PLAIN: ("viewer/src/plain-worker.js", "viewer/src/scene-viewer-plain.js"),
+    SPATIAL: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
 }  # Of each kind, the worker that loads, and the module with the viewer
 _FORMATS = "decoder/src/formats.js"
@@ -51,5 +51,5 @@ def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
     if version == 2:
         files[_FORMATS] = only_2
     viewers = {name: files.pop(viewer) for name, (_, viewer) in _KINDS.items()}
-    files[_KINDS[PLAIN][1]] = viewers[kind]
+    files[_KINDS[SPATIAL][1]] = viewers[kind]
     return files

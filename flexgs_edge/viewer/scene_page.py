@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,17 @@ from flexgs_edge.viewer.join import join_modules, shorten_style
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'
-_SCRIPT = '<script type="module" src="src/page.js"></script>'
+_SCRIPT = re.compile(r'<script type="module" src="src/page.js".*?</script>')
+_CANVAS = '<canvas id="canvas"'
+POSTER = "poster.jpg"
+EMBED = """Upload this folder to any web server, and put these lines into a page; change the address to where the folder is:
+
+<iframe src="https://example.org/folder/" width="960" height="540" style="border: 0" allow="fullscreen; clipboard-write"
+  title="A scene in three dimensions" loading="lazy"></iframe>
+
+The page starts from another view with ?view= after the address: "Copy a link to this view" in its panel makes one.
+The server must not compress scene.fgs on the way. It should answer ranges of bytes; large scenes then load what is in sight.
+"""
 _CHARSET = '<meta charset="utf-8">'
 
 
@@ -71,14 +82,33 @@ def viewer_page(
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
     made = f'<script type="module" id="script">{script}</script>'
-    changes = {_SCRIPT: made, _STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
+    (tag,) = _SCRIPT.findall(files[PAGE])
+    changes = {tag: made, _STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
     if scene is None:
         policy += "; connect-src 'self'"
     else:
         changes[_CHARSET] = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
         data = base64.b64encode(scene).decode()
-        changes[_SCRIPT] = f'<script type="application/octet-stream" id="scene-bytes">{data}</script>\n{made}'
+        changes[tag] = f'<script type="application/octet-stream" id="scene-bytes">{data}</script>\n{made}'
     return Page(_replaced(files[PAGE], changes), policy)
+
+
+def site_files(
+    files: Mapping[str, str], config: Mapping[str, Any], kind: str, poster: bytes | None = None
+) -> dict[str, bytes]:
+    """The files of a web site by their name, but for the scene: any server of files will do.
+
+    `files`, `config`, `kind`: as for `viewer_page`; `config` names the scene. `poster`: a JPEG of the first view, which is
+    shown until the scene is.
+    """
+    made = viewer_page(files, config, kind=kind)
+    policy = made.policy.replace("img-src ", "img-src 'self' ")
+    head = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    changes = {_CHARSET: head}
+    if poster is not None:
+        changes[_CANVAS] = f'<img id="poster" src="{POSTER}" alt="">\n{_CANVAS}'
+    site = {"index.html": _replaced(made.text, changes).encode(), "embed.txt": EMBED.encode()}
+    return site if poster is None else {**site, POSTER: poster}
 
 
 def _digest(text: str) -> str:

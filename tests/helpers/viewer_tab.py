@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -56,6 +58,34 @@ def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
     finally:
         ready[0].stop()
         thread.join(20)
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@contextmanager
+def site(folder: Path) -> Iterator[str]:
+    """The address of a plain web server of a folder: no ranges."""
+    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=web.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{web.server_port}"
+    finally:
+        web.shutdown()
+        web.server_close()
+
+
+def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bool = False) -> None:
+    """Load the page and wait for the whole scene."""
+    tab.events.clear()
+    tab.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 400)
+    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+    tab.send("Emulation.setEmulatedMedia", features=[scheme])
+    tab.send("Page.navigate", url=address)
+    tab.wait("Page.loadEventFired")
+    until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
 
 
 def until(tab: Tab, condition: str) -> None:

@@ -15,9 +15,11 @@ import sys
 import urllib.parse
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from flexgs_edge.cameras.start import START
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.commands.view import view
@@ -40,7 +42,7 @@ CAMERA = {
     "fy": 40,
 }
 
-MOST_SENT = {(1, PLAIN): 26_900, (2, PLAIN): 25_500, (2, PREVIEWED): 26_500, (2, SPATIAL): 29_100}
+MOST_SENT = {(1, PLAIN): 28_600, (2, PLAIN): 27_300, (2, PREVIEWED): 28_200, (2, SPATIAL): 31_100}
 """Bytes of viewer and decoder with gzip, by the version and the kind of the scene."""
 
 
@@ -97,6 +99,60 @@ def test_other_scenes_are_coded_with_16_bits(tmp_path: Path) -> None:
     (tmp_path / "coded.fgs").write_bytes(data)
     header = read_header(tmp_path / "coded.fgs")
     assert (header.count, header.sh_degree, header.version if hasattr(header, "version") else 1) == (200, 1, 1)
+
+
+def start_at(eye: list[float]) -> dict[str, Any]:
+    return {START: {"eye": eye, "target": [eye[0], 0, 5], "up": [0, -1, 0], "fov": [50, 40]}}
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_cameras_of_another_scene_beside_a_file(scene: Path, own: bool, caplog: pytest.LogCaptureFixture) -> None:
+    scene.unlink()
+    write_grid(scene, make_grid(300, 1), start_at([1234.5 if own else 0.0, 0, -3]))
+    output = scene.with_suffix(".html")
+    result = view(scene, output)
+    assert (CAMERA["img_name"] in output.read_text().replace("\\u003c", "<")) is own
+    assert ("was made with other cameras" in caplog.text) is not own
+    if own:
+        assert result.views == 1
+    assert view(scene, output, cameras=str(scene.with_name("cameras.json")), force=True).views == 1
+
+
+def test_a_file_that_says_where_to_start_needs_no_views(scene: Path) -> None:
+    scene.unlink()
+    write_grid(scene, make_grid(300, 1), start_at([0.0, 0, -3]))
+    scene.with_name("cameras.json").unlink()
+    assert view(scene, scene.with_suffix(".html")).views == 0
+    assert view(scene, scene.with_name("auto.html"), cameras="auto").views > 0
+    # What has to be coded anew keeps it.
+    view(scene, scene.with_name("cropped.html"), crop="-9999,-9999,-9999,9999,9999,9999")
+    data = base64.b64decode(part(scene.with_name("cropped.html").read_text(), "scene-bytes"))
+    scene.write_bytes(data)
+    assert read_header(scene).settings == start_at([0.0, 0, -3])
+
+
+def test_a_folder_for_a_web_site(scene: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    result = view(scene, site)
+    assert {path.name for path in site.iterdir()} == {
+        "index.html",
+        "embed.txt",
+        "scene.fgs",
+    }  # no start view, no poster
+    assert (site / "scene.fgs").read_bytes() == scene.read_bytes() and "<iframe" in (site / "embed.txt").read_text()
+    page = (site / "index.html").read_text()
+    assert json.loads(part(page, "scene"))["scene"] == "scene.fgs" and "poster" not in page.partition("<body>")[2][:200]
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None and "connect-src 'self'" in policy[1]
+    check_digests(page, policy[1])
+    assert result.to_json()["output"] == str(site)
+    with pytest.raises(InputError, match="not empty"):
+        view(scene, site)
+    scene.unlink()
+    write_grid(scene, make_grid(300, 1), {"near": 0.01, **start_at([1234.5, 0, -3])})
+    view(scene, site, force=True)
+    assert (site / "poster.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert '<img id="poster" src="poster.jpg"' in (site / "index.html").read_text()
 
 
 def test_arguments_that_are_wrong(scene: Path) -> None:

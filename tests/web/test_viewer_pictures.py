@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,19 +23,8 @@ from flexgs_edge.run.live import fine_steps
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.source import MemorySource
-from viewer_tab import LOOK, POSES, Drawn, decibels, drag, faults, picture, requests, served, until
+from viewer_tab import LOOK, POSES, Drawn, decibels, drag, faults, go, picture, requests, served, site, until
 from web_vectors import FOLDER
-
-
-def go(tab: Browser, address: str, width: int = 480, height: int = 360, dark: bool = False) -> None:
-    """Load the page and wait for the whole scene."""
-    tab.events.clear()
-    tab.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 400)
-    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-    tab.send("Emulation.setEmulatedMedia", features=[scheme])
-    tab.send("Page.navigate", url=address)
-    tab.wait("Page.loadEventFired")
-    until(tab, "globalThis.viewer && viewer.stats.wholeMs > 0 && viewer.stats.firstMs > 0")
 
 
 @pytest.mark.parametrize("distance", [3e4, 2e7])
@@ -308,17 +293,10 @@ def test_a_damaged_file_is_no_scene(tab: Browser, scene: Path, sample_dir: Path,
     assert tab.run("viewer.renderer.drawn") == 0
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
-
-
 def test_the_decoder_runs_in_a_worker_of_another_page(tab: Browser, repository: Path) -> None:
     """As an npm package would: modules from a server, the file by ranges or as a stream, errors with their byte."""
-    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(repository / "web" / "decoder")))
-    threading.Thread(target=web.serve_forever, daemon=True).start()
-    try:
-        vectors = f"http://127.0.0.1:{web.server_port}/tests/vectors"
+    with site(repository / "web" / "decoder") as address:
+        vectors = f"{address}/tests/vectors"
         tab.send("Page.navigate", url=f"{vectors}/vectors.json")
         tab.wait("Page.loadEventFired")
         script = """(async (source) => {
@@ -337,9 +315,6 @@ def test_the_decoder_runs_in_a_worker_of_another_page(tab: Browser, repository: 
         assert tab.run(f"fetch('{name}').then((answer) => answer.blob()).then({script})") == wanted
         failed = tab.run(f"{script}('vectors.json').catch((error) => [error.name, error.offset, error.message])")
         assert failed[:2] == ["FgsError", 0] and "not a .fgs file" in failed[2]
-    finally:
-        web.shutdown()
-        web.server_close()
 
 
 def chunk_rows(path: Path) -> list[int]:

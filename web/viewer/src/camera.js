@@ -109,6 +109,40 @@ export function outsidePose(box, origin) {
   return { name: 'outside', position, rotation: [right, cross(forward, right), forward], width, height, fx: focal, fy: focal, cx, cy };
 }
 
+/** The pose of a start view (docs/format.md); null for anything else. */
+export function startPose(start) {
+  const { eye, target, up, fov } = start ?? {};
+  const three = (list) => Array.isArray(list) && list.length === 3 && list.every(Number.isFinite);
+  const angles = Array.isArray(fov) && fov.length === 2 && fov.every((angle) => angle > 0 && angle < 180);
+  if (!angles || ![eye, target, up].every(three)) return null;
+  const away = subtract(target, eye);
+  const forward = unit(away);
+  const right = unit(cross(forward, up), unit(cross(forward, Math.abs(forward[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0])));
+  const [width, height] = fov.map((angle) => 2 * Math.tan((angle * Math.PI) / 360));
+  const lens = { width, height, fx: 1, fy: 1, cx: (width - 1) / 2, cy: (height - 1) / 2 };
+  const depth = Math.hypot(...away);
+  return { name: 'start', position: eye, rotation: [right, cross(forward, right), forward], up: unit(up), depth, ...lens };
+}
+
+/** What `startPose` reads, of a camera. */
+export function startOf({ eye, target, up, lens }, origin) {
+  const fov = [lens.width / lens.fx, lens.height / lens.fy].map((size) => (Math.atan(size / 2) * 360) / Math.PI);
+  return { eye: add(eye, origin), target: add(target, origin), up, fov };
+}
+
+/** A start view as one word of an address. */
+export function viewWord({ eye, target, up, fov }) {
+  return [...eye, ...target, ...up, ...fov].map((value) => Number(value.toPrecision(7))).join();
+}
+
+/** The start view of such a word; undefined for none. */
+export function viewOfWord(word) {
+  const numbers = word?.split(',').map(Number);
+  if (numbers?.length !== 11) return undefined;
+  const [eye, target, up] = [0, 3, 6].map((at) => numbers.slice(at, at + 3));
+  return { eye, target, up, fov: numbers.slice(9) };
+}
+
 /** The box around most positions: all but a twentieth at each end, on each axis. */
 export function boxOf(means, rows) {
   const ends = [0, 1, 2].map((axis) => {

@@ -12,13 +12,19 @@ const MOVES = {
 };
 const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
+/** Whether a key belongs to the field that it is typed in. */
+export function isTyping({ target }) {
+  return Boolean(target.matches?.('select, textarea, input:not([type="checkbox"])'));
+}
+
 export class Controls {
   /**
    * @param {HTMLElement} element
    * @param {() => import('./camera.js').Camera} camera
    * @param {() => void} moved
+   * @param {EventTarget} keys where keys are heard: the document of a page that is about one scene
    */
-  constructor(element, camera, moved) {
+  constructor(element, camera, moved, keys = element) {
     this.element = element;
     this.camera = camera;
     this.moved = moved;
@@ -30,9 +36,9 @@ export class Controls {
     for (const end of ['pointerup', 'pointercancel']) element.addEventListener(end, (event) => this.#up(event));
     element.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
     element.addEventListener('contextmenu', (event) => event.preventDefault());
-    element.addEventListener('keydown', (event) => this.#key(event, true));
-    element.addEventListener('keyup', (event) => this.#key(event, false));
-    element.addEventListener('blur', () => this.held.clear());
+    keys.addEventListener('keydown', (event) => isTyping(event) || this.#key(event, true));
+    keys.addEventListener('keyup', (event) => this.#key(event, false));
+    for (const left of [element, globalThis]) left.addEventListener('blur', () => this.held.clear());
   }
 
   /** Whether a key is held, so that frames must follow each other. */
@@ -80,7 +86,7 @@ export class Controls {
   /** Two fingers: their distance zooms, their middle moves. */
   #pinch(before, now, other) {
     const wide = (place) => Math.max(Math.hypot(place[0] - other[0], place[1] - other[1]), 10);
-    this.camera().zoom(wide(before) / wide(now));
+    this.#closer(wide(before) / wide(now));
     this.#pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
   }
 
@@ -95,13 +101,20 @@ export class Controls {
   #wheel(event) {
     event.preventDefault();
     const factor = Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.001)));
-    if (this.fly) this.camera().move(0, 0, (1 - factor) * this.camera().distance);
-    else this.camera().zoom(factor);
+    this.#closer(factor);
     this.moved();
   }
 
+  /** Come closer by a factor of the distance: to the target, or with it when flying. */
+  #closer(factor) {
+    const camera = this.camera();
+    if (this.fly) camera.move(0, 0, (1 - factor) * camera.distance);
+    else camera.zoom(factor);
+  }
+
   #key(event, down) {
-    if (!(event.code in MOVES || event.code in TURNS) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!(event.code in MOVES || event.code in TURNS)) return;
+    if (down && (event.ctrlKey || event.metaKey || event.altKey)) return;
     event.preventDefault();
     if (down) this.held.add(event.code);
     else this.held.delete(event.code);

@@ -1,11 +1,27 @@
-import { openArriving } from './arriving.js';
-import { headerOf, sendAll, sendError } from './load.js';
+import { open, openPreview } from '../../decoder/src/index.js';
+import { headerOf, sendAll, sendChunk, sendError, sendPreview } from './load.js';
 
-/** Decode a scene as it comes, and pack it for the textures. In: { source, name }. Out: { header }, { chunk }, { done } or { error }. */
-async function load(source, name) {
-  const file = await openArriving(source, name);
-  self.postMessage({ header: headerOf(file) });
-  await sendAll(file);
+/**
+ * Decode the chunks that the page asks for, and pack them for the textures. In: { source, name }; then { all: true } for the preview and chunk
+ * after chunk, { preview, start, shStart } for the preview, or { get, start, shStart, shEnd } for one. Out: { header }, { chunk }, { done }
+ * or { error }.
+ */
+let file = null;
+let preview = null;
+
+async function act(data) {
+  if (data.all) {
+    if (preview) await sendPreview(preview, file.shDegree, file.count, headerOf(file).shRows);
+    return sendAll(file);
+  }
+  if (data.get !== undefined) {
+    return sendChunk(await file.chunk(data.get), file.shDegree, data.start, data.shStart, data.shEnd);
+  }
+  if (data.preview) return sendPreview(preview, file.shDegree, data.start, data.shStart);
+  file = await open(data.source, { name: data.name });
+  preview = await openPreview(file, data.name);
+  const small = preview && headerOf(preview);
+  return self.postMessage({ header: { ...headerOf(file), anyChunk: Boolean(file.chunk), preview: small } });
 }
 
-self.onmessage = ({ data }) => load(data.source, data.name).catch(sendError);
+self.onmessage = ({ data }) => act(data).catch(sendError);

@@ -1,9 +1,12 @@
 // The page: its buttons and texts. All text of files reaches it as text, never as HTML.
+import { startOf, viewOfWord, viewWord } from './camera.js';
+import { isTyping } from './controls.js';
 import { bytesInside } from './inside.js';
 import { SceneViewer } from './scene-viewer.js';
 
 const find = (id) => document.getElementById(id);
 const config = JSON.parse(find('scene')?.textContent || '{}');
+const asked = new URLSearchParams(location.search);
 const status = find('status');
 
 function say(text, isError = false) {
@@ -17,8 +20,8 @@ function start() {
   const first = firstScene();
   let viewer;
   try {
-    const half = new URLSearchParams(location.search).get('bits') !== '8';
-    viewer = new SceneViewer(canvas, { half, first });
+    const half = asked.get('bits') !== '8';
+    viewer = new SceneViewer(canvas, { half, first, keys: document });
   } catch (error) {
     say(error.message, true);
     return;
@@ -26,7 +29,8 @@ function start() {
   globalThis.viewer = viewer;
   wire(viewer);
   wireFiles(viewer);
-  if (first) show(viewer, first.source, first.name, config.poses, config.look);
+  const begin = { poses: config.poses, look: config.look, start: viewOfWord(asked.get('view')) };
+  if (first) show(viewer, first.source, first.name, begin);
   else say('Drop a .fgs file here, or choose one in the panel.');
 }
 
@@ -34,15 +38,17 @@ function start() {
 function firstScene() {
   const bytes = bytesInside('scene-bytes');
   if (bytes) return { source: bytes, name: config.name };
-  const address = config.scene ?? new URLSearchParams(location.search).get('scene');
-  return address ? { source: new URL(address, location.href).href, name: config.name ?? address } : null;
+  const address = config.scene ?? asked.get('scene');
+  if (!address) return null;
+  const source = new URL(address, location.href);
+  return { source: source.href, name: config.name ?? decodeURIComponent(source.pathname.split('/').pop()) };
 }
 
-async function show(viewer, source, name, poses = [], look = {}) {
+async function show(viewer, source, name, begin = {}) {
   say('Loading …');
   document.title = name ? `${name} – flexgs-edge` : 'flexgs-edge';
   find('name').textContent = name ?? '';
-  await viewer.load(source, { name, poses, look, agree }).catch(() => {});
+  await viewer.load(source, { name, ...begin, agree }).catch(() => {});
 }
 
 async function agree(bytes) {
@@ -60,10 +66,13 @@ function wire(viewer) {
     listPoses(viewer);
   });
   viewer.addEventListener('poses', () => listPoses(viewer));
-  viewer.addEventListener('first', () => viewer.stats.wholeMs || say('Loading the rest …'));
-  viewer.addEventListener('loaded', () => say(viewer.header.count ? '' : 'The scene is empty.'));
+  viewer.addEventListener('first', () => {
+    find('poster')?.remove();
+    if (!viewer.stats.wholeMs) say('Loading the rest …');
+  });
+  viewer.addEventListener('loaded', () => say(viewer.header.count ? roomNote(viewer) : 'The scene is empty.'));
   viewer.addEventListener('failed', (event) => say(event.detail, true));
-  viewer.addEventListener('frame', () => showNumbers(viewer));
+  for (const name of ['frame', 'timed']) viewer.addEventListener(name, () => showNumbers(viewer));
   const change = (id, act) => find(id).addEventListener('input', (event) => (act(event.target), viewer.refresh()));
   change('pose', (field) => viewer.setPose(Number(field.value)));
   change('degree', (field) => (viewer.look.degree = Number(field.value)));
@@ -74,21 +83,30 @@ function wire(viewer) {
   change('scale', (field) => (viewer.scale = Number(field.value)));
   change('theme', (field) => (document.documentElement.dataset.theme = field.value));
   find('reset').addEventListener('click', () => viewer.setPose(viewer.pose ?? 0));
+  find('link').addEventListener('click', () => copyLink(viewer));
   find('full').addEventListener('click', () => fullScreen());
   find('save').addEventListener('click', () => save(viewer));
   document.addEventListener('keydown', (event) => shortcut(viewer, event));
 }
 
+/** What a device shows that has no room for all. */
+function roomNote({ rows, header, share }) {
+  return share < 1 ? `This device has room for ${rows} of ${header.count} splats: it shows those that cover most.` : '';
+}
+
 function shortcut(viewer, event) {
-  const typing = /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName);
-  if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
+  // Brackets need Alt on many keyboards.
+  const plain = !event.metaKey && (/^[[\]]$/.test(event.key) || !(event.ctrlKey || event.altKey));
+  if (isTyping(event) || !plain) return;
   const acts = {
     r: () => viewer.setPose(viewer.pose ?? 0),
     f: fullScreen,
+    l: () => copyLink(viewer),
     p: () => save(viewer),
     '[': () => turnPage(viewer, -1),
     ']': () => turnPage(viewer, 1),
     '?': () => (find('panel').open = !find('panel').open),
+    Escape: () => (find('panel').open = false),
   };
   const act = acts[event.key];
   if (act) {
@@ -106,11 +124,26 @@ function turnPage(viewer, by) {
 
 function listPoses(viewer) {
   find('pose').replaceChildren(...viewer.poses.map((pose, i) => new Option(pose.name || String(i), String(i))));
+  find('pose').value = String(viewer.pose ?? 0);
 }
 
 function fullScreen() {
   if (document.fullscreenElement) document.exitFullscreen();
   else document.documentElement.requestFullscreen?.().catch(() => say('This browser does not allow a full screen.'));
+}
+
+/** Copy the address of this page with the camera's view. Pages without a right to the clipboard show it. */
+async function copyLink(viewer) {
+  if (!viewer.header) return;
+  const link = new URL(location.href);
+  link.searchParams.set('view', viewWord(startOf(viewer.camera, viewer.header.origin)));
+  try {
+    await navigator.clipboard.writeText(link.href);
+    say('The link to this view is copied.');
+    setTimeout(() => say(''), 3000);
+  } catch {
+    prompt('The link to this view:', link.href);
+  }
 }
 
 async function save(viewer) {

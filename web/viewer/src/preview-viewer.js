@@ -4,6 +4,8 @@ import { Viewer } from './viewer.js';
 /** A viewer that shows a scene's preview until the first layer is there. */
 export class PreviewViewer extends Viewer {
   roomOf(header) {
+    this.previewed = null;
+    if (!header.preview) return super.roomOf(header);
     this.previewed = new Previewed(this, header, header.preview);
     return this.previewed.room;
   }

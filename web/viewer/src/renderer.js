@@ -31,6 +31,12 @@ export class Renderer {
     return header.count * TEXELS * 16 + header.shRows * shTexels(header.shDegree) * 16;
   }
 
+  /** How many rows, and rows with SH, textures have room for. */
+  most(degree) {
+    const lines = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE);
+    return { count: (lines * TEXTURE_WIDTH) / TEXELS, shRows: lines * shPerLine(degree) };
+  }
+
   /** Make room for a scene. */
   begin(header) {
     const { gl } = this;
@@ -38,9 +44,9 @@ export class Renderer {
     this.degree = header.shDegree;
     const dataLines = Math.max(1, Math.ceil((header.count * TEXELS) / TEXTURE_WIDTH));
     const shLines = Math.max(1, Math.ceil(header.shRows / shPerLine(header.shDegree)));
-    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    if (Math.max(dataLines, shLines) > most) {
-      throw new Error(`The scene has ${header.count} splats; this device has room for ${(most * TEXTURE_WIDTH) / TEXELS}.`);
+    const { count, shRows } = this.most(header.shDegree);
+    if (header.count > count || header.shRows > shRows) {
+      throw new Error(`The scene has ${header.count} splats; this device has room for ${count}.`);
     }
     this.data = makeTexture(gl, gl.RGBA32UI, TEXTURE_WIDTH, dataLines);
     this.sh = makeTexture(gl, gl.RGBA32UI, TEXTURE_WIDTH, shLines);
@@ -54,6 +60,19 @@ export class Renderer {
     upload(gl, this.data, data, start * TEXELS, TEXTURE_WIDTH);
     const texels = shTexels(this.degree);
     if (shRows) upload(gl, this.sh, sh, shStart * texels, shPerLine(this.degree) * texels);
+  }
+
+  /** Call back when the device has done all that it was told: it works on by itself. */
+  whenDone(then) {
+    const { gl } = this;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const look = () => {
+      if (fence && gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) return setTimeout(look, 1);
+      gl.deleteSync(fence);
+      return then();
+    };
+    setTimeout(look, 0);
   }
 
   /** The rows to draw, back to front. */

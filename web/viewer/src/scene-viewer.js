@@ -1,3 +1,3 @@
-import { Viewer } from './viewer.js';
+import { SpatialViewer } from './spatial-viewer.js';
 
-export const SceneViewer = Viewer;
+export const SceneViewer = SpatialViewer;

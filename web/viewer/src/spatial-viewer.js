@@ -1,14 +1,15 @@
 import { shPerLine, TEXELS, TEXTURE_WIDTH } from './pack.js';
 import { SpacePreview } from './preview-space.js';
+import { PreviewViewer } from './preview-viewer.js';
 import { Renderer } from './renderer.js';
 import { Space } from './space.js';
-import { GROWTH_POWER, UNASKED_BYTES, Viewer } from './viewer.js';
+import { GROWTH_POWER, UNASKED_BYTES } from './viewer.js';
 
 /** Chunks that are asked for at once: one comes while another is decoded. */
 const AT_ONCE = 2;
 
-/** A viewer of large scenes: chunks in sight come first, and a budget bounds how many are held. */
-export class SpatialViewer extends Viewer {
+/** A viewer of all scenes. Of large ones, chunks in sight come first, and a budget bounds how many are held. */
+export class SpatialViewer extends PreviewViewer {
   constructor(canvas, options) {
     super(canvas, options);
     this.addEventListener('frame', () => this.#ask());
@@ -26,22 +27,22 @@ export class SpatialViewer extends Viewer {
   roomOf(header) {
     this.asking = 0;
     this.rested = false;
-    this.previewed = null;
+    this.spacePreview = null;
     this.space = Space.tells(header) ? new Space(header, this.#budget(header.shDegree)) : null;
     if (!this.space) {
       this.loader.postMessage({ all: true });
-      return header;
+      return super.roomOf(header);
     }
     const { room } = this.space;
     if (!header.preview) return room;
-    this.previewed = new SpacePreview(this, this.space, header.preview);
+    this.spacePreview = new SpacePreview(this, this.space, header.preview);
     this.loader.postMessage({ preview: true, start: room.count, shStart: room.shRows });
-    return this.previewed.room;
+    return this.spacePreview.room;
   }
 
   get growth() {
     if (!this.space) return super.growth;
-    if (this.previewed && !this.space.sightIsHere) return 1;
+    if (this.spacePreview && !this.space.sightIsHere) return 1;
     const { layers, cutFrom, count } = this.header;
     const missing = layers.length > 1 ? this.space.missing : 1;
     return ((missing * (cutFrom ?? { count }).count) / count) ** GROWTH_POWER;
@@ -54,11 +55,11 @@ export class SpatialViewer extends Viewer {
     if (own) {
       this.asking--;
       this.space.arrived(chunk.index);
-    } else if (chunk) this.previewed?.add(chunk);
+    } else if (chunk) this.spacePreview?.add(chunk);
     const done = await super.loaded(data, agree);
     if (!this.space) return done;
     if (data.header) this.placeBox(this.space.box);
-    this.previewed?.update();
+    this.spacePreview?.update();
     this.#ask();
     return this.rested;
   }

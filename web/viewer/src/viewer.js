@@ -1,12 +1,22 @@
-import { boxOf, Camera, outsidePose, upOf } from './camera.js';
+import { boxOf, Camera, outsidePose, startPose, upOf } from './camera.js';
 import { Controls } from './controls.js';
 import { Renderer } from './renderer.js';
 import { subtract, dot, times, add } from './vectors.js';
+import { shTexels } from './pack.js';
+import { shareOf, thinChunk } from './thin.js';
 import { startWorker } from './workers.js';
 
 /** Bytes of graphics memory that are taken without asking. */
 export const UNASKED_BYTES = 256 * 2 ** 20;
 export const GROWTH_POWER = 1 / 8;
+/** Most pixels of a picture, on phones and elsewhere. */
+const PIXELS = { coarse: 2e6, fine: 9e6 };
+/** While the camera moves, frames that take longer than this many milliseconds have fewer pixels, down to this scale. */
+const SMOOTH_MS = 50;
+const LEAST_SCALE = 0.25;
+const REST_MS = 200;
+/** While chunks come, this share of the time goes into pictures, at most. */
+const DRAWING_SHARE = 0.2;
 
 /**
  * A scene on a canvas. It draws when something changed, and while a key is held.
@@ -16,10 +26,10 @@ export const GROWTH_POWER = 1 / 8;
 export class Viewer extends EventTarget {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}}} [options] `first` is decoded while the
-   *   shaders are compiled; `load` must be called with it at once
+   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}, keys?: EventTarget}} [options] `first` is decoded while the
+   *   shaders are compiled; `load` must be called with it at once. `keys`: as for `Controls`
    */
-  constructor(canvas, { half, first } = {}) {
+  constructor(canvas, { half, first, keys } = {}) {
     super();
     this.canvas = canvas;
     this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
@@ -29,10 +39,12 @@ export class Viewer extends EventTarget {
     this.controls = new Controls(
       canvas,
       () => this.camera,
-      () => this.refresh(),
+      () => this.#moved(),
+      keys,
     );
     this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
     this.scale = 1;
+    this.movingScale = 1;
     this.poses = [];
     this.stats = {};
     this.#reset();
@@ -43,6 +55,8 @@ export class Viewer extends EventTarget {
   #reset() {
     this.header = null;
     this.rows = 0;
+    this.shRows = 0;
+    this.share = 1;
     this.order = null;
     this.box = null;
     this.wanted = false;
@@ -56,15 +70,18 @@ export class Viewer extends EventTarget {
    * Load a scene.
    *
    * @param {string | Uint8Array | Blob} source an absolute address, or bytes
-   * @param {{name: string, poses: object[], pose?: number, look?: object, agree?: (bytes: number) => Promise<boolean>}} options
+   * @param {{name: string, poses: object[], pose?: number, start?: object, look?: object,
+   *   agree?: (bytes: number) => Promise<boolean>}} options `pose`: index of the first one, in place of the view that the
+   *   scene starts from; `start`: that view, in place of the file's
    * @returns {Promise<void>} when all is there
    */
-  async load(source, { name, poses = [], pose = 0, look = {}, agree = async () => true }) {
+  async load(source, { name, poses = [], pose, start, look = {}, agree = async () => true }) {
     this.loader?.terminate();
     this.sorter?.terminate();
     this.#reset();
     this.poses = poses;
     this.pose = pose;
+    this.start = start;
     this.asked = look;
     const begun = this.fresh?.first?.source === source && this.fresh;
     const { load, sort } = this.fresh ?? { load: startWorker('load'), sort: startWorker('sort') };
@@ -104,9 +121,11 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
-  /** How many rows need room, and how many of them have SH. */
+  /** How many rows get room, and how many of them have SH. */
   roomOf(header) {
-    return header;
+    this.share = shareOf(header, this.renderer.most(header.shDegree));
+    const [count, shRows] = [header.count, header.shRows].map((rows) => Math.floor(this.share * rows));
+    return { ...header, count, shRows };
   }
 
   async #begin(header, agree) {
@@ -124,13 +143,23 @@ export class Viewer extends EventTarget {
     this.look.degree = header.shDegree;
     Object.assign(this.look, this.asked);
     Object.assign(this.stats, { splats: header.count, bytes: header.size, layers: header.layers.length });
-    this.camera = new Camera(upOf(this.poses));
+    this.#placeStart(startPose(this.start) ?? startPose(header.settings.start));
     if (this.poses.length) this.setPose(this.pose);
     this.#tell('begun');
     return false;
   }
 
-  #add(chunk) {
+  /** The view to start from becomes the last of the poses. */
+  #placeStart(start) {
+    this.camera = new Camera(start?.up ?? upOf(this.poses));
+    if (start) this.poses = [...this.poses, start];
+    this.pose ??= start ? this.poses.length - 1 : 0;
+  }
+
+  #add(whole) {
+    const at = { start: this.rows, shStart: this.shRows };
+    const chunk = this.share < 1 ? thinChunk(whole, this.share, at, 4 * shTexels(this.header.shDegree)) : whole;
+    this.shRows += chunk.shRows;
     this.renderer.add(chunk);
     this.rows += chunk.rows;
     if (!this.box) this.placeBox(boxOf(chunk.means, chunk.rows));
@@ -139,7 +168,7 @@ export class Viewer extends EventTarget {
     this.sortedFor = null;
     // Not with the next frame: a frame of what is there may take longer than the sort.
     this.#sortIfNeeded();
-    this.refresh();
+    this.#refreshSoon();
   }
 
   /** The scene lies in this box: so far away the camera turns around it. */
@@ -159,8 +188,9 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
-  /** How far a pose is from the middle of the scene. */
+  /** How far a pose is from what it looks at: the middle of the scene, unless it says so. */
   #depthOf(pose) {
+    if (pose.depth) return pose.depth;
     if (!this.box) return 1;
     const eye = subtract(pose.position, this.header.origin);
     const middle = times(add(this.box.low, this.box.high), 0.5);
@@ -177,6 +207,7 @@ export class Viewer extends EventTarget {
   /** Factor on all scales while layers are missing (docs/drawing.md): what is there fills the gaps. */
   get growth() {
     const { layers, cutFrom, count } = this.header;
+    if (this.share < 1 && layers.length === 1) return this.share ** -GROWTH_POWER;
     const layered = cutFrom || layers.length > 1;
     return layered && this.rows ? ((cutFrom ?? { count }).count / this.rows) ** GROWTH_POWER : 1;
   }
@@ -188,7 +219,22 @@ export class Viewer extends EventTarget {
     requestAnimationFrame((now) => this.#frame(now));
   }
 
+  /** Draw when the pictures have had their share of the time. */
+  #refreshSoon() {
+    const wait = this.stats.firstMs ? this.stats.frameMs / DRAWING_SHARE - (performance.now() - this.lastDraw) : 0;
+    if (wait <= 0) this.refresh();
+    else this.later ??= setTimeout(() => ((this.later = null), this.refresh()), wait);
+  }
+
+  #moved() {
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => ((this.resting = null), this.refresh()), REST_MS);
+    this.refresh();
+  }
+
   #frame(now) {
+    // The device still draws the last one: a frame behind it would show where the camera was.
+    if (this.drawing) return requestAnimationFrame((next) => this.#frame(next));
     this.wanted = false;
     const seconds = Math.min((now - (this.lastFrame ?? now)) / 1000, 0.1);
     this.lastFrame = this.controls.active ? now : undefined;
@@ -197,10 +243,11 @@ export class Viewer extends EventTarget {
       this.refresh();
     }
     if (!this.header) return;
-    const start = performance.now();
+    this.lastDraw = performance.now();
     this.#sortIfNeeded();
     this.renderer.draw(this.view, this.look, this.growth);
-    this.stats.frameMs = performance.now() - start;
+    this.drawing = true;
+    this.renderer.whenDone(() => this.#drew());
     this.stats.drawn = this.renderer.drawn;
     if (this.renderer.drawn && !this.stats.firstMs) {
       this.stats.firstMs = performance.now() - this.started;
@@ -209,11 +256,25 @@ export class Viewer extends EventTarget {
     this.#tell('frame');
   }
 
+  /** A frame is done. */
+  #drew() {
+    this.drawing = false;
+    this.stats.frameMs = performance.now() - this.lastDraw;
+    if (this.resting) {
+      const scale = this.movingScale * Math.sqrt(SMOOTH_MS / Math.max(this.stats.frameMs, 1));
+      this.movingScale = Math.min(1, Math.max(LEAST_SCALE, scale));
+    }
+    this.#tell('timed');
+  }
+
   /** The camera's view on the canvas as it is. */
   get view() {
-    const ratio = (globalThis.devicePixelRatio || 1) * this.scale;
-    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((size) =>
-      Math.max(1, Math.round(size * ratio)),
+    const { clientWidth, clientHeight } = this.canvas;
+    const most = PIXELS[matchMedia('(pointer: coarse)').matches ? 'coarse' : 'fine'];
+    const density = Math.min(globalThis.devicePixelRatio || 1, Math.sqrt(most / Math.max(1, clientWidth * clientHeight)));
+    const ratio = density * this.scale * (this.resting ? this.movingScale : 1);
+    const [width, height] = [clientWidth, clientHeight].map((size) =>
+      Math.max(1, Math.floor(size * ratio + 1e-6)),
     );
     return this.camera.view(width, height);
   }

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
-import { boxOf, Camera, outsidePose, upOf } from '../src/camera.js';
+import { boxOf, Camera, outsidePose, startOf, startPose, upOf, viewOfWord, viewWord } from '../src/camera.js';
 import { toHalf } from '../src/half.js';
 import { NO_SH, packChunk, shPerLine, shTexels } from '../src/pack.js';
 import { Sorter } from '../src/sort.js';
@@ -121,4 +121,34 @@ test('turning keeps the axes square and the distance', () => {
   assert.ok(up[1] < 0);
   const box = boxOf(Float32Array.from({ length: 300 }, (_, i) => i % 100), 100);
   assert.ok(box.low[0] > 0 && box.high[0] < 99);
+});
+
+test('a start view stands upright, and survives an address', () => {
+  const start = { eye: [500001, 2, 3], target: [500004, 4, 9], up: [0, -0.6, 0.8], fov: [60, 40] };
+  const pose = startPose(start);
+  const camera = new Camera(pose.up);
+  const origin = [500000, 0, 0];
+  camera.setPose(pose, origin, pose.depth);
+  axesAreRight(camera);
+  assert.ok(Math.abs(dot(camera.axes[0], start.up)) < 1e-9 && dot(camera.axes[1], start.up) < 0);
+  assert.ok(Math.abs(camera.distance - 7) < 1e-9);
+  const { fx, fy } = camera.view(1200, 100);
+  assert.ok(Math.abs(100 / 2 / fy - Math.tan((20 * Math.PI) / 180)) < 1e-9 && Math.abs(fx - fy) < 1e-9);
+  const again = viewOfWord(viewWord(startOf(camera, origin)));
+  for (const name of Object.keys(start)) {
+    again[name].forEach((value, i) => assert.ok(Math.abs(value - start[name][i]) < 0.05, name));
+  }
+});
+
+test('what is no start view gives no pose', () => {
+  const start = { eye: [0, 0, 0], target: [0, 0, 1], up: [0, -1, 0], fov: [60, 40] };
+  for (const [name, value] of [['eye', [0, 0]], ['target', 'abc'], ['up', [0, null, 0]], ['fov', [0, 40]], ['fov', [60, 180]]]) {
+    assert.equal(startPose({ ...start, [name]: value }), null);
+  }
+  for (const none of [undefined, null, 3, 'abc', []]) assert.equal(startPose(none), null);
+  for (const target of [[0, 0, 1], [1, 1, 1], [0, 0, 0]]) {
+    for (const up of [[0, 0, 1], [1, 1, 1], [0, 0, 0]]) axesAreRight({ axes: startPose({ ...start, target, up }).rotation });
+  }
+  for (const word of [null, undefined, '', '1,2,3']) assert.equal(viewOfWord(word), undefined);
+  assert.equal(startPose(viewOfWord('a,b,c,d,e,f,g,h,i,j,k')), null);
 });

@@ -1,3 +1,0 @@
-import { SpatialViewer } from './spatial-viewer.js';
-
-export const SceneViewer = SpatialViewer;
