@@ -102,7 +102,7 @@ def view(
         config = page_config(name, cameras, look, _SCENE_NAME)
         if output is not None:
             poster = _poster(run, StartView.stored(read_header(scene).settings))
-            site = site_files(files, config, kind, poster)
+            site = site_files(file_version(scene), config, kind, poster)
             with atomic_folder(output, force) as folder:
                 for path, content in site.items():
                     (folder / path).write_bytes(content)
@@ -116,6 +116,9 @@ def view(
         server = SceneServer(resources, host, port)
         address = server.address(PAGE)
         LOG.info("%s is at %s until Ctrl-C", name, address)
+        others = server.address_for_others(PAGE)
+        if others is not None:
+            LOG.warning("warning: other machines see the scene, too, if they know the address: %s", others)
         if ready is not None:
             ready(server)
         if browser:

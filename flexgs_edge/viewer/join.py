@@ -46,9 +46,9 @@ def _shorten_shader(text: str) -> str:
 def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     """One short script that does what one of several modules does.
 
-    On a page it is the entry `page`, in a worker the one with the worker's name. So page and workers share one text. All
-    modules but the entries share one scope, since that makes the script shorter: no two of them may have one name at their
-    top, and none may import under another name.
+    On a page it is the entry `page`, in a worker the one with the worker's name: page and workers share one text, which it
+    knows as `ownScript()`. All modules but the entries share one scope, since that makes the script shorter: no two of them
+    may have one name at their top, and none may import under another name.
 
     `files`: texts by path. `entries`: paths of the modules to run, by name. Raises `ValueError` for an import, export
     or name of a form that is not understood, and for a name that two modules have.
@@ -60,7 +60,8 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     _check_names(parts)
     body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
     chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
-    return shorten_script(f"(() => {{\n'use strict';\n{body}\n{chosen}\n}})();") + "\n"
+    own = "const ownScript = () => `(${joined})()`;"
+    return shorten_script(f"(function joined() {{\n'use strict';\n{own}\n{body}\n{chosen}\n}})();") + "\n"
 
 
 def _add(files: Mapping[str, str], path: str, parts: dict[str, str]) -> None:

@@ -11,21 +11,27 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.viewer.assets import PAGE, PLAIN, STYLE, entries_of
+from flexgs_edge.viewer.assets import ELEMENT, PAGE, PLAIN, SPATIAL, STYLE, entries_of, web_files
 from flexgs_edge.viewer.join import join_modules, shorten_style
 
 _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'
 _SCRIPT = re.compile(r'<script type="module" src="src/page.js".*?</script>')
 _CANVAS = '<canvas id="canvas"'
-POSTER = "poster.jpg"
-EMBED = """Upload this folder to any web server, and put these lines into a page; change the address to where the folder is:
+POSTER, ELEMENT_SCRIPT = "poster.jpg", "flexgs-scene.js"
+EMBED = """Upload this folder to any web server. To show the scene in a page of yours, put one of these into it, with the address
+of the folder:
 
 <iframe src="https://example.org/folder/" width="960" height="540" style="border: 0" allow="fullscreen; clipboard-write"
   title="A scene in three dimensions" loading="lazy"></iframe>
 
-The page starts from another view with ?view= after the address: "Copy a link to this view" in its panel makes one.
+<script src="https://example.org/folder/flexgs-scene.js"></script>
+<flexgs-scene src="https://example.org/folder/scene.fgs" poster="https://example.org/folder/poster.jpg" turn="10"></flexgs-scene>
+
+The element also takes view="..." and controls="none"; it tells first, loaded and failed. The page takes ?view= and ?turn=
+after its address. "Copy a link to this view" in the page's panel makes a view.
 The server must not compress scene.fgs on the way. It should answer ranges of bytes; large scenes then load what is in sight.
+If your page is on another server than the folder, that server has to allow it (Access-Control-Allow-Origin).
 """
 _CHARSET = '<meta charset="utf-8">'
 
@@ -93,21 +99,20 @@ def viewer_page(
     return Page(_replaced(files[PAGE], changes), policy)
 
 
-def site_files(
-    files: Mapping[str, str], config: Mapping[str, Any], kind: str, poster: bytes | None = None
-) -> dict[str, bytes]:
+def site_files(version: int, config: Mapping[str, Any], kind: str, poster: bytes | None = None) -> dict[str, bytes]:
     """The files of a web site by their name, but for the scene: any server of files will do.
 
-    `files`, `config`, `kind`: as for `viewer_page`; `config` names the scene. `poster`: a JPEG of the first view, which is
-    shown until the scene is.
+    `version`, `kind`: of the scene's file. `config`: from `page_config`; it names the scene. `poster`: a JPEG of the first
+    view, which is shown until the scene is.
     """
-    made = viewer_page(files, config, kind=kind)
+    made = viewer_page(web_files(version, kind), config, kind=kind)
     policy = made.policy.replace("img-src ", "img-src 'self' ")
     head = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
     changes = {_CHARSET: head}
     if poster is not None:
         changes[_CANVAS] = f'<img id="poster" src="{POSTER}" alt="">\n{_CANVAS}'
     site = {"index.html": _replaced(made.text, changes).encode(), "embed.txt": EMBED.encode()}
+    site[ELEMENT_SCRIPT] = join_modules(web_files(version, SPATIAL), ELEMENT).encode()
     return site if poster is None else {**site, POSTER: poster}
 
 

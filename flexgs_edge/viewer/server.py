@@ -75,9 +75,25 @@ class SceneServer:
 
     def address(self, path: str) -> str:
         """The address of a resource, as this machine reaches it."""
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)
-        host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/{self.secret}/{path}"
+        return self._address({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host), path)
+
+    def _address(self, host: str, path: str) -> str:
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.secret}/{path}"
+
+    def address_for_others(self, path: str) -> str | None:
+        """The address of a resource for other machines; None if they do not reach this server."""
+        if self.host in ("127.0.0.1", "localhost", "::1"):
+            return None
+        if self.host not in ("0.0.0.0", "::"):
+            return self.address(path)
+        try:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.connect(
+                    ("192.0.2.1", 9)
+                )  # nothing is sent: it tells by which of its addresses this machine is seen
+                return self._address(probe.getsockname()[0], path)
+        except OSError:  # no network
+            return self.address(path)
 
     def serve(self) -> None:
         """Answer requests until `stop`, or an interrupt."""

@@ -90,7 +90,8 @@ def test_small_files_go_to_every_format(wild: Path, tmp_path: Path, short_search
         assert (back.count, back.sh_degree) == (count, kept)
     views = open_run(wild / name, ViewOptions()).seen
     given = GivenViews([camera.scaled(160, 120) for camera in views.cameras[:16]])
-    for suffix in (".fgs", *PLAIN):
+    turn = SMALL.index(name) % len(PLAIN)  # each format gets some of the files: all would take minutes
+    for suffix in (".fgs", PLAIN[turn], PLAIN[turn - 1]):
         result = compress(wild / name, tmp_path / f"small{suffix}", given=given, near=views.near, **QUICK)
         back = open_scene(tmp_path / f"small{suffix}")
         assert 1 <= back.count == result.count <= count

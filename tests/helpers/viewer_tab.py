@@ -61,14 +61,22 @@ def served(scene: Path, cameras: str, **words: Any) -> Iterator[str]:
 
 
 class _Quiet(SimpleHTTPRequestHandler):
+    others = False
+
+    def end_headers(self) -> None:
+        if self.others:
+            self.send_header("Access-Control-Allow-Origin", "*")
+        super().end_headers()
+
     def log_message(self, format: str, *args: Any) -> None:
         pass
 
 
 @contextmanager
-def site(folder: Path) -> Iterator[str]:
-    """The address of a plain web server of a folder: no ranges."""
-    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+def site(folder: Path, others: bool = False) -> Iterator[str]:
+    """The address of a plain web server of a folder: no ranges. `others`: pages of other servers may read it."""
+    handler = type("Handler", (_Quiet,), {"others": others})
+    web = ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(folder)))
     threading.Thread(target=web.serve_forever, daemon=True).start()
     try:
         yield f"http://127.0.0.1:{web.server_port}"

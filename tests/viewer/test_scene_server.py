@@ -257,11 +257,17 @@ def test_secrets_differ(server: SceneServer) -> None:
     other._server.server_close()
 
 
+def test_a_server_for_this_machine_has_no_address_for_others(server: SceneServer) -> None:
+    assert server.address_for_others("a") is None
+
+
 def test_hosts_of_a_server_for_other_machines() -> None:
     made = SceneServer({}, host="0.0.0.0")
     try:
         for host, known in (("192.168.1.5", True), ("evil.example", False), ("localhost", True), ("[::1]", True)):
             assert made.knows(f"{host}:{made.port}") is known
         assert made.address("a").startswith(f"http://127.0.0.1:{made.port}/")
+        others = made.address_for_others("a")
+        assert others is not None and re.fullmatch(rf"http://[0-9.]+:{made.port}/{made.secret}/a", others)
     finally:
         made._server.server_close()

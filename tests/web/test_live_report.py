@@ -58,7 +58,7 @@ def test_the_page_holds_the_file_and_the_original(page: Path, tmp_path: Path, sa
 
 
 def test_both_scenes_follow_one_camera(tab: Browser, page: Path) -> None:
-    tab.open(page, 1000)
+    tab.open(page, 500)
     assert tab.run("document.getElementById('live-stage').hidden && globalThis.liveViewers === undefined")
     tab.run("document.getElementById('live-start').click()")
     until(

@@ -40,7 +40,7 @@ def eye(tab: Browser) -> list[float]:
 def test_a_folder_is_a_web_site(tab: Browser, started: Path, start: StartView, tmp_path: Path) -> None:
     result = view(started, tmp_path / "site")
     names = sorted(path.name for path in (tmp_path / "site").iterdir())
-    assert names == ["embed.txt", "index.html", "poster.jpg", "scene.fgs"]
+    assert names == ["embed.txt", "flexgs-scene.js", "index.html", "poster.jpg", "scene.fgs"]
     assert result.page_size == sum(path.stat().st_size for path in (tmp_path / "site").iterdir())
     poster = np.asarray(Image.open(tmp_path / "site" / "poster.jpg"), np.float64)
     with site(tmp_path / "site") as address:

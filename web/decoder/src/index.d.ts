@@ -15,7 +15,10 @@ export type Prefetched = { url: string; size: number; first: Uint8Array; last: U
 /** Ask a server for the first and the last bytes of a file, while the worker that decodes it is still starting. */
 export function prefetch(url: string | URL, init?: RequestInit): Promise<Prefetched>;
 
-/** An address is asked for ranges; a server without them, a `Response` and a stream are read as they come. */
+/**
+ * An address is asked for ranges; a server without them, a `Response` and a stream are read as they come. In Node a string without a
+ * scheme and a `file:` address are files, and a stream of its own (`Readable`) is a stream.
+ */
 export type Source =
   | ArrayBuffer
   | ArrayBufferView
@@ -25,7 +28,8 @@ export type Source =
   | string
   | URL
   | RangedSource
-  | Prefetched;
+  | Prefetched
+  | { pipe: Function };
 
 export interface OpenOptions {
   /** Name of the file, which errors begin with. */

@@ -15,8 +15,11 @@ export class BlobSource {
   }
 }
 
+const inNode = typeof globalThis.process?.versions?.node === 'string';
+
 /**
- * The source of what a caller gives: bytes, a blob, a stream, a response, an address, or an object with `size` and `read`.
+ * The source of what a caller gives: bytes, a blob, a stream, a response, an address (in Node also a path or a stream of
+ * its own), or an object with `size` and `read`.
  * @returns {Promise<MemorySource | BlobSource | HttpSource | StreamSource | {size: number, read: Function}>}
  */
 export async function toSource(given, init = {}) {
@@ -25,6 +28,12 @@ export async function toSource(given, init = {}) {
     return new MemorySource(new Uint8Array(given.buffer, given.byteOffset, given.byteLength));
   }
   if (typeof Blob !== 'undefined' && given instanceof Blob) return new BlobSource(given);
+  if (inNode) {
+    const node = await import('#node');
+    const address = typeof given === 'string' || given instanceof URL;
+    if (address && node.isPath(given)) return node.PathSource.of(given);
+    if (typeof given?.pipe === 'function') return node.streamSource(given);
+  }
   if (typeof given === 'string' || given instanceof URL) return prefetched(await prefetch(given, init), init);
   if (typeof Response !== 'undefined' && given instanceof Response) return new StreamSource(bodyOf(given));
   if (typeof given?.getReader === 'function') return new StreamSource(given);

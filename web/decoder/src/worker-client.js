@@ -6,7 +6,7 @@ export { FgsError };
  * Open a file in a worker. See `worker-client.d.ts`.
  */
 export async function openInWorker(source, { worker, ...options } = {}) {
-  const port = worker ?? new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
+  const port = worker ?? startWorker();
   const remote = new Remote(port);
   // An address is relative to the page, not to the worker's script.
   const given = typeof source === 'string' || source instanceof URL ? new URL(source, globalThis.location?.href).href : source;
@@ -17,6 +17,16 @@ export async function openInWorker(source, { worker, ...options } = {}) {
   } catch (error) {
     remote.end();
     throw error;
+  }
+}
+
+function startWorker() {
+  try {
+    return new Worker(new URL('./worker.js', import.meta.url), { type: 'module' });
+  } catch {
+    // Browsers start no worker of another server. One of this page may import it.
+    const text = `import ${JSON.stringify(new URL('./worker.js', import.meta.url).href)};`;
+    return new Worker(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })), { type: 'module' });
   }
 }
 

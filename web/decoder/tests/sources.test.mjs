@@ -1,7 +1,9 @@
 import assert from 'node:assert/strict';
-import { readFileSync } from 'node:fs';
+import { createReadStream, readFileSync } from 'node:fs';
 import { createServer } from 'node:http';
+import { relative } from 'node:path';
 import { test } from 'node:test';
+import { fileURLToPath } from 'node:url';
 import { FgsError, looksLikeFgs, open, openPreview, prefetch } from '../src/index.js';
 import { readAll, streamOf } from './read.mjs';
 
@@ -209,4 +211,15 @@ test('a preview comes before the chunks, and can be opened', async () => {
   await assert.rejects(async () => {
     for await (const chunk of preview.chunks()) assert.ok(chunk);
   }, /a\.fgs \(preview\): byte \d+: /);
+});
+
+test('in Node: a path, a file address, a stream of its own', async () => {
+  const place = new URL(NAME, FOLDER);
+  const path = fileURLToPath(place);
+  for (const given of [path, relative(process.cwd(), path), place, place.href]) {
+    assert.deepEqual(await readAll(given), wanted);
+    assert.ok((await open(given)).chunk, 'any chunk can be had');
+  }
+  assert.deepEqual(await readAll(createReadStream(path)), wanted);
+  await assert.rejects(open('no such file.fgs'), { code: 'ENOENT' });
 });

@@ -2,7 +2,7 @@ import * as THREE from 'three';
 import { OrbitControls } from 'three/addons/controls/OrbitControls.js';
 import { SparkRenderer, SplatMesh } from '@sparkjsdev/spark';
 import { open } from '@flexgs/decoder';
-import { limitSides, sparkOptions, splatsOf } from './fgs-splats.js';
+import { limitSides, sparkOptions, splatsOf } from '@flexgs/decoder/spark';
 
 const asked = new URLSearchParams(location.search);
 const status = document.getElementById('status');

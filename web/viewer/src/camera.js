@@ -32,6 +32,12 @@ export class Camera {
     this.axes = [right, cross(forward, right), forward];
   }
 
+  /** Look at a point, upright, and turn around it. */
+  lookAt(point) {
+    this.target = point;
+    this.#level(unit(subtract(point, this.eye), this.axes[2]));
+  }
+
   /** Turn around the target, by angles to the side and up. */
   orbit(side, upwards) {
     const away = subtract(this.eye, this.target);

@@ -22,23 +22,31 @@ export class Controls {
    * @param {HTMLElement} element
    * @param {() => import('./camera.js').Camera} camera
    * @param {() => void} moved
-   * @param {EventTarget} keys where keys are heard: the document of a page that is about one scene
+   * @param {{keys?: EventTarget, guest?: boolean, signal?: AbortSignal}} [options] `keys`: where keys are heard, such as the document
+   *   of a page that is about one scene. `guest`: on a page of something else, which scrolls until the element is clicked.
    */
-  constructor(element, camera, moved, keys = element) {
+  constructor(element, camera, moved, { keys = element, guest = false, signal } = {}) {
     this.element = element;
     this.camera = camera;
     this.moved = moved;
     this.fly = false;
+    this.touched = false; // whether anybody has moved the camera
     this.pointers = new Map();
     this.held = new Set();
-    element.addEventListener('pointerdown', (event) => this.#down(event));
-    element.addEventListener('pointermove', (event) => this.#move(event));
-    for (const end of ['pointerup', 'pointercancel']) element.addEventListener(end, (event) => this.#up(event));
-    element.addEventListener('wheel', (event) => this.#wheel(event), { passive: false });
-    element.addEventListener('contextmenu', (event) => event.preventDefault());
-    keys.addEventListener('keydown', (event) => isTyping(event) || this.#key(event, true));
-    keys.addEventListener('keyup', (event) => this.#key(event, false));
-    for (const left of [element, globalThis]) left.addEventListener('blur', () => this.held.clear());
+    this.guest = guest;
+    const hear = (target, names, act) => names.forEach((name) => target.addEventListener(name, act, { signal, passive: false }));
+    hear(element, ['pointerdown'], (event) => this.#down(event));
+    hear(element, ['pointermove'], (event) => this.#move(event));
+    hear(element, ['pointerup', 'pointercancel'], (event) => this.#up(event));
+    hear(element, ['wheel'], (event) => this.#wheel(event));
+    hear(element, ['contextmenu'], (event) => event.preventDefault());
+    hear(keys, ['keydown', 'keyup'], (event) => isTyping(event) || this.#key(event, event.type === 'keydown'));
+    hear(element, ['blur'], () => this.held.clear());
+    hear(globalThis, ['blur'], () => this.held.clear());
+    if (!guest) return;
+    element.style.touchAction = 'pan-y';
+    hear(element, ['focus'], () => (element.style.touchAction = 'none'));
+    hear(element, ['blur'], () => (element.style.touchAction = 'pan-y'));
   }
 
   /** Whether a key is held, so that frames must follow each other. */
@@ -63,6 +71,7 @@ export class Controls {
   }
 
   #down(event) {
+    this.touched = true;
     this.element.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
   }
@@ -99,6 +108,7 @@ export class Controls {
   }
 
   #wheel(event) {
+    if (this.guest && !this.element.matches(':focus')) return;
     event.preventDefault();
     const factor = Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.001)));
     this.#closer(factor);
@@ -116,6 +126,7 @@ export class Controls {
     if (!(event.code in MOVES || event.code in TURNS)) return;
     if (down && (event.ctrlKey || event.metaKey || event.altKey)) return;
     event.preventDefault();
+    this.touched = true;
     if (down) this.held.add(event.code);
     else this.held.delete(event.code);
     this.moved();

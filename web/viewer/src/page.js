@@ -27,6 +27,7 @@ function start() {
     return;
   }
   globalThis.viewer = viewer;
+  if (!matchMedia('(prefers-reduced-motion: reduce)').matches) viewer.turning = Number(asked.get('turn')) || 0;
   wire(viewer);
   wireFiles(viewer);
   const begin = { poses: config.poses, look: config.look, start: viewOfWord(asked.get('view')) };
@@ -70,8 +71,17 @@ function wire(viewer) {
     find('poster')?.remove();
     if (!viewer.stats.wholeMs) say('Loading the rest …');
   });
+  viewer.addEventListener('chunk', () => {
+    const part = Math.floor((100 * viewer.rows) / (viewer.share * viewer.header.count));
+    if (viewer.stats.firstMs && part < 100) say(`Loading … ${part} %`);
+  });
   viewer.addEventListener('loaded', () => say(viewer.header.count ? roomNote(viewer) : 'The scene is empty.'));
-  viewer.addEventListener('failed', (event) => say(event.detail, true));
+  viewer.addEventListener('failed', (event) => {
+    say(event.detail, true);
+    const again = Object.assign(document.createElement('button'), { textContent: 'Try again', type: 'button' });
+    again.addEventListener('click', () => (say('Loading …'), viewer.retry()));
+    status.append(' ', again);
+  });
   for (const name of ['frame', 'timed']) viewer.addEventListener(name, () => showNumbers(viewer));
   const change = (id, act) => find(id).addEventListener('input', (event) => (act(event.target), viewer.refresh()));
   change('pose', (field) => viewer.setPose(Number(field.value)));

@@ -3,6 +3,7 @@
 
 const DIGIT_BITS = 11;
 const SIZE = 1 << DIGIT_BITS;
+const CONE = 0.02;
 
 /** Sorts growing lists of rows. */
 export class Sorter {
@@ -40,6 +41,30 @@ export class Sorter {
       at += importance.length;
     }
     return all;
+  }
+
+  /**
+   * The splat that a ray meets first, or about so: of those that show much, the nearest within a narrow cone.
+   *
+   * @param {number[]} eye where the ray begins
+   * @param {number[]} way its direction, of length 1
+   * @param {number} near as for `sort`
+   * @returns {number[] | null} where it lies
+   */
+  pick(eye, way, near) {
+    let [best, least] = [null, Infinity];
+    for (const { means, importance } of this.parts) {
+      const rows = importance.length;
+      for (let i = 0; i < rows; i++) {
+        const [x, y, z] = [means[i] - eye[0], means[rows + i] - eye[1], means[2 * rows + i] - eye[2]];
+        const depth = x * way[0] + y * way[1] + z * way[2];
+        if (!(depth > near) || depth >= least) continue;
+        const radius = Math.exp(importance[i] / 2); // of a disc of its area
+        const away2 = x * x + y * y + z * z - depth * depth;
+        if (away2 < Math.min(radius, CONE * depth) ** 2) [best, least] = [[means[i], means[rows + i], means[2 * rows + i]], depth];
+      }
+    }
+    return best;
   }
 
   /**

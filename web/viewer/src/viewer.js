@@ -1,7 +1,7 @@
-import { boxOf, Camera, outsidePose, startPose, upOf } from './camera.js';
+import { boxOf, Camera, outsidePose, startOf, startPose, upOf } from './camera.js';
 import { Controls } from './controls.js';
 import { Renderer } from './renderer.js';
-import { subtract, dot, times, add } from './vectors.js';
+import { add, dot, subtract, times, unit } from './vectors.js';
 import { shTexels } from './pack.js';
 import { shareOf, thinChunk } from './thin.js';
 import { startWorker } from './workers.js';
@@ -26,12 +26,17 @@ const DRAWING_SHARE = 0.2;
 export class Viewer extends EventTarget {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}, keys?: EventTarget}} [options] `first` is decoded while the
-   *   shaders are compiled; `load` must be called with it at once. `keys`: as for `Controls`
+   * @param {{half?: boolean, first?: {source: string | Uint8Array, name: string}, keys?: EventTarget, guest?: boolean}} [options] `first` is decoded while the
+   *   shaders are compiled; `load` must be called with it at once. `keys`, `guest`: as for
+   *   `Controls`
    */
-  constructor(canvas, { half, first, keys } = {}) {
+  constructor(canvas, { half, first, keys, guest } = {}) {
     super();
     this.canvas = canvas;
+    this.half = half;
+    this.turning = 0; // degrees a second, until somebody moves the camera
+    this.ending = new AbortController();
+    const { signal } = this.ending;
     this.fresh = { load: startWorker('load'), sort: startWorker('sort'), first, started: performance.now() };
     if (first) this.fresh.load.postMessage(first);
     this.renderer = new Renderer(canvas, { half });
@@ -40,16 +45,50 @@ export class Viewer extends EventTarget {
       canvas,
       () => this.camera,
       () => this.#moved(),
-      keys,
+      { keys, guest, signal },
     );
+    canvas.addEventListener('dblclick', ({ clientX, clientY }) => this.focus(clientX, clientY), { signal });
     this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
     this.scale = 1;
     this.movingScale = 1;
     this.poses = [];
     this.stats = {};
     this.#reset();
-    new ResizeObserver(() => this.refresh()).observe(canvas);
-    canvas.addEventListener('webglcontextlost', () => this.#fail('The graphics device was lost: load the page again.'));
+    this.sized = new ResizeObserver(() => this.refresh());
+    this.sized.observe(canvas);
+    canvas.addEventListener('webglcontextlost', (event) => this.#lost(event), { signal });
+    canvas.addEventListener('webglcontextrestored', () => this.#restored(), { signal });
+  }
+
+  #lost(event) {
+    event.preventDefault(); // else it never comes back
+    this.loader?.terminate();
+    this.#fail('The graphics device was lost. The scene comes back with it.');
+  }
+
+  #restored() {
+    this.renderer = new Renderer(this.canvas, { half: this.half });
+    this.retry();
+  }
+
+  /** Load the last scene again, at the camera's view. */
+  retry() {
+    if (!this.last) return;
+    const [source, options] = this.last;
+    const start = this.header ? startOf(this.camera, this.header.origin) : options.start;
+    this.load(source, { ...options, start }).catch(() => {});
+  }
+
+  /** End its workers and let go of the device. The canvas cannot be drawn on again. */
+  dispose() {
+    this.ending.abort();
+    this.sized.disconnect();
+    clearTimeout(this.resting);
+    clearTimeout(this.later);
+    for (const worker of [this.loader, this.sorter, this.fresh?.load, this.fresh?.sort]) worker?.terminate();
+    this.header = null;
+    this.controls.held.clear();
+    this.renderer.gl.getExtension('WEBGL_lose_context')?.loseContext();
   }
 
   #reset() {
@@ -78,6 +117,7 @@ export class Viewer extends EventTarget {
   async load(source, { name, poses = [], pose, start, look = {}, agree = async () => true }) {
     this.loader?.terminate();
     this.sorter?.terminate();
+    this.last = [source, { name, poses, pose, start, look, agree }];
     this.#reset();
     this.poses = poses;
     this.pose = pose;
@@ -169,6 +209,7 @@ export class Viewer extends EventTarget {
     // Not with the next frame: a frame of what is there may take longer than the sort.
     this.#sortIfNeeded();
     this.#refreshSoon();
+    this.#tell('chunk');
   }
 
   /** The scene lies in this box: so far away the camera turns around it. */
@@ -237,12 +278,16 @@ export class Viewer extends EventTarget {
     if (this.drawing) return requestAnimationFrame((next) => this.#frame(next));
     this.wanted = false;
     const seconds = Math.min((now - (this.lastFrame ?? now)) / 1000, 0.1);
-    this.lastFrame = this.controls.active ? now : undefined;
+    const turns = this.turning && !this.controls.touched;
+    this.lastFrame = this.controls.active || turns ? now : undefined;
+    if (!this.header) return;
     if (this.controls.active) {
       this.controls.step(seconds);
-      this.refresh();
+      this.#moved();
+    } else if (turns && this.stats.wholeMs) {
+      this.camera.orbit((this.turning * seconds * Math.PI) / 180, 0);
+      this.#moved();
     }
-    if (!this.header) return;
     this.lastDraw = performance.now();
     this.#sortIfNeeded();
     this.renderer.draw(this.view, this.look, this.growth);
@@ -290,7 +335,21 @@ export class Viewer extends EventTarget {
     this.sorter.postMessage(message, buffer ? [buffer] : []);
   }
 
-  #sorted({ order, count, ms }) {
+  /** Turn around what lies at a place of the canvas, in CSS pixels. */
+  focus(x, y) {
+    const box = this.canvas.getBoundingClientRect();
+    const { fx, fy, cx, cy } = this.camera.view(box.width, box.height);
+    const [right, down, forward] = this.camera.axes;
+    const way = unit(add(forward, add(times(right, (x - box.left - cx) / fx), times(down, (y - box.top - cy) / fy))));
+    this.sorter?.postMessage({ pick: { eye: this.camera.eye, way, near: this.look.near } });
+  }
+
+  #sorted({ order, count, ms, picked }) {
+    if (picked !== undefined) {
+      if (picked) this.camera.lookAt(picked);
+      this.#moved();
+      return;
+    }
     this.sorting = null;
     this.renderer.setOrder(order, count);
     this.order = order.buffer;

@@ -1,13 +1,13 @@
 let own = null;
 
 /**
- * Start a worker. In a page of one file, which may load nothing, it runs the page's own script: its name says as what.
+ * Start a worker. One script of all modules runs itself in it: `ownScript` stands in such a script, and a worker's name says what it
+ * does. A module of another server is imported by a worker of this page, since browsers start none from elsewhere.
  * @param {'load' | 'sort'} name
  */
 export function startWorker(name) {
-  const inline = document.getElementById('script');
-  if (inline) own ??= URL.createObjectURL(new Blob([inline.textContent], { type: 'text/javascript' }));
-  const address = own ?? new URL(`./${name}-worker.js`, import.meta.url);
-  // Chromium starts no module from a text on a page from disk.
-  return new Worker(address, { type: inline ? 'classic' : 'module', name });
+  const text = (parts) => URL.createObjectURL(new Blob([parts], { type: 'text/javascript' }));
+  if (typeof ownScript === 'function') return new Worker((own ??= text(ownScript())), { name });
+  const { href, origin } = new URL(`./${name}-worker.js`, import.meta.url);
+  return new Worker(origin === location.origin ? href : text(`import ${JSON.stringify(href)};`), { type: 'module', name });
 }

@@ -152,3 +152,18 @@ test('what is no start view gives no pose', () => {
   for (const word of [null, undefined, '', '1,2,3']) assert.equal(viewOfWord(word), undefined);
   assert.equal(startPose(viewOfWord('a,b,c,d,e,f,g,h,i,j,k')), null);
 });
+
+test('a double click finds what a ray meets first', () => {
+  const sorter = new Sorter();
+  const logs = (radii) => Float32Array.from(radii, (radius) => 2 * Math.log(radius));
+  sorter.add(Float32Array.of(0, 0, 0.1, 0, 0, 0, 0, 0, 5, 9, 4, -2), logs([1, 1, 0.05, 1]));
+  assert.deepEqual(sorter.pick([0, 0, 0], [0, 0, 1], 0.2), [0, 0, 5]);
+  assert.deepEqual(sorter.pick([0, 0, 0], [0, 0, 1], 6), [0, 0, 9]);
+  assert.deepEqual(sorter.pick([0.1, 0, 0], [0, 0, 1], 0.2).map((v) => Math.round(10 * v) / 10), [0.1, 0, 4]);
+  assert.equal(sorter.pick([0, 0, 0], [0, 1, 0], 0.2), null);
+  const camera = new Camera([0, -1, 0]);
+  camera.eye = [1, 1, 1];
+  camera.lookAt([4, 5, 1]);
+  axesAreRight(camera);
+  assert.ok(Math.abs(camera.distance - 5) < 1e-9 && Math.abs(camera.axes[0][1]) < 1e-9);
+});
