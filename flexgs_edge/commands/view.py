@@ -36,6 +36,7 @@ from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
 from flexgs_edge.run.reporter import encode
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import ViewSet
+from flexgs_edge.units import format_size
 from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
 from flexgs_edge.viewer.scene_page import page_config, site_files, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
@@ -44,6 +45,7 @@ FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
 """Bits of a scene that is coded only to be looked at."""
 _SCENE_NAME = "scene.fgs"
 _SCENE = f"viewer/{_SCENE_NAME}"
+PAGE_MOST = 100_000_000  # Bytes of a page that phones and mail still take
 POSTER_SIZE, POSTER_QUALITY = (960, 540), 70  # It comes before the scene on slow networks, so it is small
 
 
@@ -98,6 +100,10 @@ def view(
             page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), kind).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
+            if len(page) > PAGE_MOST:
+                LOG.warning(
+                    "warning: browsers may not open a page of %s: compress the scene first", format_size(len(page))
+                )
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
         config = page_config(name, cameras, look, _SCENE_NAME)
         if output is not None:

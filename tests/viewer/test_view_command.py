@@ -131,6 +131,14 @@ def test_a_file_that_says_where_to_start_needs_no_views(scene: Path) -> None:
     assert read_header(scene).settings == start_at([0.0, 0, -3])
 
 
+def test_a_page_that_browsers_may_not_open(
+    scene: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flexgs_edge.commands.view.PAGE_MOST", 50_000)
+    view(scene, scene.with_suffix(".html"))
+    assert "may not open a page of" in caplog.text
+
+
 def test_a_folder_for_a_web_site(scene: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     result = view(scene, site)

@@ -83,6 +83,12 @@ def test_a_hosted_page_and_a_dropped_file_start_there_too(
         assert eye(tab) == pytest.approx(start.eye)
 
 
+def test_modules_do_not_load_from_disk_and_the_page_says_so(tab: Browser, repository: Path) -> None:
+    tab.send("Page.navigate", url=(repository / "web" / "viewer" / "index.html").as_uri())
+    tab.wait("Page.loadEventFired")
+    until(tab, "document.getElementById('status').textContent.includes('needs a web server')")
+
+
 def test_a_list_of_cameras_comes_before_the_start_view(
     tab: Browser, started: Path, start: StartView, sample_dir: Path
 ) -> None:
