@@ -17,7 +17,7 @@ from flexgs_edge.cameras.scene_sample import SceneSample, Splats
 
 CONVENTION = (0.0, -1.0, 0.0)
 """Up in COLMAP's frame."""
-RING_POWER = 8
+RING_POWER = 4
 """A place counts by this power of what it shows: places near the training cameras show far more."""
 RING_FLAT = 0.5
 """Cameras lie near a plane if they scatter along its normal by less than this share of their scatter within it."""
