@@ -39,7 +39,7 @@ def test_both_scenes_are_there(run: Run[Any], coded: Path, tmp_path: Path) -> No
     made = live_scenes(run, coded, 2)
     assert made.compressed == coded.read_bytes() and made.original is not None and made.note == ""
     assert made.config["first"] == 2 and len(made.config["poses"]) == len(run.seen.cameras)
-    assert "use strict" in made.script[:20]
+    assert "use strict" in made.script[:40]
 
 
 @pytest.mark.parametrize(
