@@ -17,6 +17,7 @@ START = "start"
 """Name of the view in the settings of a file."""
 PLACE_DIGITS = 9
 """Significant digits of places, which may lie far from zero."""
+FARTHEST = 1e15
 SAME_PLACE = 1e-6
 LEVEL_MOST = 0.99
 """Cosine of the direction of view and up. Beyond, the picture's own up is taken."""
@@ -38,7 +39,7 @@ class StartView:
         """The view in the settings of a file; None if there is none that makes sense."""
         found = settings.get(START)
         lists = [found.get(name) for name in ("eye", "target", "up", "fov")] if isinstance(found, dict) else [None]
-        if not all(isinstance(numbers, list) and all(type(n) in (int, float) for n in numbers) for numbers in lists):
+        if not all(isinstance(numbers, list) and all(_is_place(n) for n in numbers) for numbers in lists):
             return None
         eye, target, up, fov = (tuple(float(number) for number in numbers) for numbers in lists if numbers is not None)
         line = np.subtract(target, eye) if len(eye) == len(target) == len(up) == 3 else np.zeros(3)
@@ -91,7 +92,8 @@ def _up_of(cameras: Sequence[Camera]) -> np.ndarray:
     """[3] f64, up: level pictures have horizontal axes at right angles to it. Without such a direction, the mean of their ups."""
     mean = -np.sum([camera.rotation[1] for camera in cameras], axis=0)
     across = np.array([camera.rotation[0] for camera in cameras])
-    (least, middle, _), axes = np.linalg.eigh(across.T @ across)
+    # No product whose sum depends on the processor: files keep the result.
+    (least, middle, _), axes = np.linalg.eigh((across[:, :, None] * across[:, None, :]).sum(axis=0))
     if least < LEVEL * middle:
         return np.asarray(axes[:, 0] * (1.0 if float((axes[:, 0] * mean).sum()) > 0 else -1.0))
     return unit(mean) if np.abs(mean).max() > 1e-6 else -cameras[0].rotation[1]
@@ -107,6 +109,10 @@ def _depths_shown(camera: Camera, positions: np.ndarray) -> np.ndarray:
     )
     shown: np.ndarray = z[inside]
     return shown
+
+
+def _is_place(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < FARTHEST
 
 
 def _place(value: float) -> float:

@@ -10,17 +10,14 @@ PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
 ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
 """The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
-LIVE = {
-    **ENTRIES,
-    "page": "viewer/src/live.js",
-    "load": "viewer/src/plain-worker.js",
-}  # The same for the live scenes of a report
+_PLAIN_WORKER = "viewer/src/plain-worker.js"
+LIVE = {**ENTRIES, "page": "viewer/src/live.js", "load": _PLAIN_WORKER}  # The same for the live scenes of a report
 ELEMENT = {**ENTRIES, "page": "viewer/src/element.js"}  # The same for the element that other pages hold
 PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
 """Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
 viewer asks for the chunks in sight first. The viewer of spatial scenes draws the others too; theirs are shorter."""
 _KINDS = {
-    PLAIN: ("viewer/src/plain-worker.js", "viewer/src/scene-viewer-plain.js"),
+    PLAIN: (_PLAIN_WORKER, "viewer/src/scene-viewer-plain.js"),
     SPATIAL: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
 }  # Of each kind, the worker that loads, and the module with the viewer

@@ -88,9 +88,8 @@ class SceneServer:
             return self.address(path)
         try:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.connect(
-                    ("192.0.2.1", 9)
-                )  # nothing is sent: it tells by which of its addresses this machine is seen
+                # Nothing is sent: it tells by which of its addresses this machine is seen.
+                probe.connect(("192.0.2.1", 9))
                 return self._address(probe.getsockname()[0], path)
         except OSError:  # no network
             return self.address(path)

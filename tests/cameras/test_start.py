@@ -67,7 +67,7 @@ def test_settings_keep_it() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [("eye", [1, 2]), ("eye", None), ("target", "abc"), ("target", [5e5, 2, 3]), ("up", [0, True, 0]), ("up", [3, 2, 6]),
-     ("fov", [60, 180]), ("fov", [60]), ("fov", [0, 40])],
+     ("fov", [60, 180]), ("fov", [60]), ("fov", [0, 40]), ("eye", [10**400, 0, 0])],
 )  # fmt: skip
 def test_settings_that_are_no_view(name: str, value: Any) -> None:
     assert StartView.stored({START: {**GOOD, name: value}}) is None

@@ -118,7 +118,7 @@ export function outsidePose(box, origin) {
 /** The pose of a start view (docs/format.md); null for anything else. */
 export function startPose(start) {
   const { eye, target, up, fov } = start ?? {};
-  const three = (list) => Array.isArray(list) && list.length === 3 && list.every(Number.isFinite);
+  const three = (list) => Array.isArray(list) && list.length === 3 && list.every((value) => Number.isFinite(value) && Math.abs(value) < 1e15);
   const angles = Array.isArray(fov) && fov.length === 2 && fov.every((angle) => angle > 0 && angle < 180);
   if (!angles || ![eye, target, up].every(three)) return null;
   const away = subtract(target, eye);

@@ -142,7 +142,7 @@ test('a start view stands upright, and survives an address', () => {
 
 test('what is no start view gives no pose', () => {
   const start = { eye: [0, 0, 0], target: [0, 0, 1], up: [0, -1, 0], fov: [60, 40] };
-  for (const [name, value] of [['eye', [0, 0]], ['target', 'abc'], ['up', [0, null, 0]], ['fov', [0, 40]], ['fov', [60, 180]]]) {
+  for (const [name, value] of [['eye', [0, 0]], ['target', 'abc'], ['up', [0, null, 0]], ['eye', [1e300, 0, 0]], ['fov', [0, 40]], ['fov', [60, 180]]]) {
     assert.equal(startPose({ ...start, [name]: value }), null);
   }
   for (const none of [undefined, null, 3, 'abc', []]) assert.equal(startPose(none), null);
