@@ -18,7 +18,9 @@ START = "start"
 PLACE_DIGITS = 9
 """Significant digits of places, which may lie far from zero."""
 FARTHEST = 1e15
+"""Numbers of a file beyond this are no places."""
 SAME_PLACE = 1e-6
+"""Cameras stand in one place if they differ by less than this share of its coordinates, which have `PLACE_DIGITS`."""
 LEVEL_MOST = 0.99
 """Cosine of the direction of view and up. Beyond, the picture's own up is taken."""
 LEVEL = 0.1

@@ -114,14 +114,14 @@ def open_run(
                 raise InputError("--images: the scene is cropped, and photos show what lies beyond: leave --images out")
             LOG.info("the scene is cropped: it is compared with its own renders, since photos show what lies beyond")
         unread = not decodes and scene.path is not None and is_fgs(scene_file(scene.path))
-        needless = scene.start is not None and companions.cameras is None and options.cameras is None
-        if unread and needless and options.up is None:
-            options = replace(options, cameras=NO_CAMERAS)  # the file says where to start, so no view has to be placed
+        would_place = companions.cameras is None and options.cameras is None and options.up is None
+        if unread and scene.start is not None and would_place:
+            options = replace(options, cameras=NO_CAMERAS)  # the file says where to start: no view has to be placed
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
         views = find_views(options, companions, scene.source, photos and scene.crop is None, given, budget)
-        beside = given is None and options.cameras is None and companions.cameras is not None
-        if beside and views is not None and scene.start is not None and not scene.start.is_of(views.cameras):
+        found_beside = given is None and options.cameras is None and companions.cameras is not None
+        if found_beside and views is not None and scene.start is not None and not scene.start.is_of(views.cameras):
             LOG.warning(
                 "warning: %s is not used: %s was made with other cameras. If it belongs to this scene, give it by --cameras",
                 *(companions.cameras, scene.path),

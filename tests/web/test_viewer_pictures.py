@@ -251,8 +251,10 @@ def test_mouse_touch_and_keys(tab: Browser, scene: Path, sample_dir: Path) -> No
         event = "new KeyboardEvent('keydown', { key: 'w', code: 'KeyW', bubbles: true })"
         tab.run(f"document.getElementById('background').dispatchEvent({event})")
         assert not tab.run("viewer.controls.active") and eye(tab) == before
-        tab.run("viewer.setPose(0); viewer.focus(300, 200)")  # what a double click does
-        until(tab, "viewer.camera.distance > 0 && !viewer.resting")
+        tab.run("viewer.setPose(0)")
+        target = tab.run("JSON.stringify(viewer.camera.target)")
+        tab.run("viewer.focus(300, 200)")  # what a double click does
+        until(tab, f"JSON.stringify(viewer.camera.target) !== {json.dumps(target)}")
         assert faults(tab) == []
 
 
