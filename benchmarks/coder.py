@@ -22,7 +22,7 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
 from flexgs_edge.grid.values import from_grid
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.choose_steps import CHROMA
 from flexgs_edge.methods.best.refit.colour import refit_colours
@@ -35,8 +35,7 @@ from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 
 STEPS = (0.002, 0.2, 0.04, 0.3, 0.06)
 """Step sizes of position, scale, rotation, opacity and constant colour, in fox's units."""

@@ -19,9 +19,9 @@ from collections.abc import Callable, Sequence
 
 import zstandard
 
-from flexgs_edge.codec.header import Section
 from flexgs_edge.codec.open_fgs import verify
-from flexgs_edge.codec.v1.header import HEADER_STEP
+from flexgs_edge.codec.sections import Section
+from flexgs_edge.codec.v1.container import HEADER_STEP
 
 NUMBERS = (0, 1, 2, 3, 0x7F, 0x80, 0xFF, 0x100, 0x7FFF, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 

@@ -24,11 +24,11 @@ from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.quality.psnr import mean_psnr, mse, psnr
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.few_poses import visible_depths
 from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import find_views
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.depths import visible_depths
 
 FACTORS = (0.25, 0.35, 0.5, 0.71, 1.0, 1.41, 2.0, 2.83, 4.0)
 

@@ -16,10 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexgs_edge.kernels.backend import Backend
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import peak_rss
+from flexgs_edge.render.renderer import Renderer
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = {
@@ -176,3 +179,15 @@ def table(lines: Sequence[str]) -> str:
         last = json.loads(lines[-1])
         text.append(f"revision {last['revision']}, {last['device']}")
     return "\n".join(text)
+
+
+def read_sums(renderer: Renderer, sums: Any, channels: int, count: int) -> np.ndarray:
+    """[channels, count] i64, the first planes of the last view's sums, for all rows of the scene."""
+    rows = renderer.view_rows
+    words = np.empty((count if rows is None else len(rows), sums.shape[1], 2), np.uint32)
+    values = renderer.backend.read(sums, words).view(np.int64)[:, :channels, 0].T
+    if rows is None:
+        return values
+    whole = np.zeros((channels, count), np.int64)
+    whole[:, rows] = values
+    return whole

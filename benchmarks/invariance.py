@@ -32,6 +32,7 @@ from flexgs_edge.methods.best.method import grid_maker
 from flexgs_edge.methods.best.search import Candidate
 from flexgs_edge.progress import Progress
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
 
 LEAST_SAME, MOST_BYTES = 0.99, 0.02
@@ -69,8 +70,8 @@ def compress_and_look(path: Path, output: Path, near: float, progress: Progress,
             steps.append(found[0])
             return found
 
-    def recording(options: CompressOptions, coder: GridCoder) -> Any:
-        make = grid_maker(options, coder)
+    def recording(run: Run[CompressOptions], coder: GridCoder) -> Any:
+        make = grid_maker(run, coder)
 
         def recorded(*given: Any) -> Any:
             maker = make(*given)

@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Timer, check
+from benchmarks.harness import SCENES, Timer, check, read_sums
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.constants import ALPHA_MAX, ALPHA_MIN, FIXED_ERROR, TILE, TRANSMITTANCE_MIN
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.kernels.cl_sources import KERNEL_DIR_VARIABLE, kernel_dir
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.progress import Progress
@@ -185,7 +185,7 @@ def compare_in_float64(
     measured, blended = np.zeros(len(rows)), np.zeros((len(rows), 2))
     progress = progress or Progress(enabled=False)
     for camera in progress.track(cameras, "removing and blending", len(cameras)):
-        sums = renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count)[0]
+        sums = read_sums(renderer, renderer.removal_sums(scene, camera), 2, scene.count)[0]
         measured += sums[rows] / FIXED_ERROR
         view = BlendedView(renderer, camera, least)
         blended += [view.removal(int(row)) for row in rows]

@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.model_folder import find_companions
-from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
+from flexgs_edge.methods.paper.method import Ranked, SceneEvaluator
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
-from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.bitpack import PAPER
 from flexgs_edge.packed.quantize import quantized_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import load_scene, resolve_drawing

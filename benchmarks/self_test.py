@@ -22,11 +22,9 @@ import numpy as np
 from benchmarks.self_test_faults import faults, judge, judge_all
 from benchmarks.self_test_scene import BLOCKS, code_all, draw_all
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
-from flexgs_edge.kernels.choose_device import choose_device, list_devices
-from flexgs_edge.kernels.form import Form
-from flexgs_edge.kernels.launch_record import RECORD, Record, checksum, load_record
+from flexgs_edge.kernels.choose_device import Form, choose_device, list_devices
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.self_test import PATTERN, Arrays, verdict
+from flexgs_edge.kernels.self_test import PATTERN, RECORD, Arrays, Record, checksum, load_record, verdict
 from flexgs_edge.memory.budget import MemoryBudget
 
 LEAST_REFUSED = 0.95

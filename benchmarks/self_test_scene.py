@@ -30,16 +30,15 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
 from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.methods.paper.prune import nonzero_sh
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.packed.quantize import quantize_scene
-from flexgs_edge.quality.flip import flips
-from flexgs_edge.quality.ssim import ssims
+from flexgs_edge.quality.similarity import flips, ssims
 from flexgs_edge.render.fit import Fit
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 
 BLOCKS = 5
 """Work-items of the serial passes: enough that some have no splats, and no divisor of the rows."""

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.harness import SCENES, Timer, backend_of, check, parse
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 

@@ -14,15 +14,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.harness import SCENES, Timer, backend_of, check, parse, run_module
+from benchmarks.harness import SCENES, Timer, backend_of, check, parse, read_sums, run_module
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.best.refit.descent import Descent
-from flexgs_edge.methods.best.refit.finetune import STRUCTURE, Schedule, rates_for
+from flexgs_edge.methods.best.refit.finetune import FIELD_RATES, STRUCTURE, Schedule
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.run.few_poses import usual_depth
 from flexgs_edge.scene.fields import FIELD
 
 STAGES = {
@@ -102,7 +103,7 @@ def bench_scores(timer: Timer, renderer: Renderer, scene: DeviceScene, cameras: 
     ways: dict[str, Callable[[Camera], object]] = {
         "drawing": lambda camera: renderer.render(scene, camera),
         "hit counting": lambda camera: renderer.add_statistics(scene, camera, statistics),
-        "removal costs": lambda camera: renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count),
+        "removal costs": lambda camera: read_sums(renderer, renderer.removal_sums(scene, camera), 2, scene.count),
     }
     found = np.empty((len(ways), timer.repeats, len(cameras)))
     for repeat in range(timer.repeats):
@@ -121,7 +122,7 @@ def bench_descent(timer: Timer, renderer: Renderer, source: PlySource, cameras: 
     """Time gradients of all values, and steps along them, relative to drawing the same views, in processor time."""
     chosen = cameras[:: max(len(cameras) // VIEWS, 1)][:VIEWS]
     planes = source.read(slice(0, source.count), list(FIELD))
-    rates = rates_for(cameras, Schedule.means_rate)
+    rates = {"means": Schedule.means_rate * usual_depth(renderer, source, chosen), **FIELD_RATES}
     with renderer.load(source) as scene:
         targets = [(0.9 * renderer.render_planes(scene, camera)).astype(np.float16) for camera in chosen]
         drawn = [

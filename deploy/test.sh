@@ -40,7 +40,7 @@ fi
 
 # Independent programs that read the files we write. Without npm their tests are skipped.
 node_packages=(@playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10 playcanvas@2.23.3 three@0.187.0
-  @sparkjsdev/spark@2.2.0 @cesium/engine@24.0.0 typescript@5.9.3)
+  @sparkjsdev/spark@2.2.0 @cesium/engine@24.0.0 typescript@5.9.3 react@18.3.1 react-dom@18.3.1)
 if ! command -v npm >/dev/null; then
   say "no npm here: the tests with other programs' readers are skipped"
 elif [ "$(cat .node/packages 2>/dev/null)" != "${node_packages[*]}" ]; then

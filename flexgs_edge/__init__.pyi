@@ -18,11 +18,11 @@ from .commands.decompress import decompress as decompress
 from .commands.devices import devices as devices
 from .commands.evaluate import evaluate as evaluate
 from .commands.info import info as info
+from .commands.render import draw_sheet as draw_sheet
 from .commands.render import render_views as render_views
 from .commands.trim import trim as trim
 from .commands.verify import verify as verify
 from .commands.view import view as view
-from .commands.views import draw_sheet as draw_sheet
 from .errors import BudgetError as BudgetError
 from .errors import DeviceError as DeviceError
 from .errors import FlexGSError as FlexGSError
@@ -32,8 +32,6 @@ from .errors import TargetError as TargetError
 from .io.ply import write_ply as write_ply
 from .kernels.choose_device import list_devices as list_devices
 from .progress import Progress as Progress
-from .report.batch_result import BatchItem as BatchItem
-from .report.batch_result import BatchResult as BatchResult
 from .report.file_results import DecompressResult as DecompressResult
 from .report.file_results import DevicesResult as DevicesResult
 from .report.file_results import RenderResult as RenderResult
@@ -41,6 +39,8 @@ from .report.file_results import TrimResult as TrimResult
 from .report.file_results import VerifyResult as VerifyResult
 from .report.file_results import ViewResult as ViewResult
 from .report.info_result import InfoResult as InfoResult
+from .report.results import BatchItem as BatchItem
+from .report.results import BatchResult as BatchResult
 from .report.results import CompressResult as CompressResult
 from .report.results import EvaluateResult as EvaluateResult
 from .run.inputs import read_scene as read_scene

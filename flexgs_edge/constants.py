@@ -4,8 +4,6 @@ Every number is rounded to float32 once and printed into the OpenCL programs (`f
 reads the values back from the device.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
@@ -72,25 +70,13 @@ SH_C0: Final = 0.28209479177387814
 SH_C1: Final = 0.4886025119029199
 SH_C2: Final = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 SH_C3: Final = (
-    -0.5900435899266435,
-    2.890611442640554,
-    -0.4570457994644658,
-    0.3731763325901154,
-    -0.4570457994644658,
-    1.445305721320277,
-    -0.5900435899266435,
-)
+    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
+    1.445305721320277, -0.5900435899266435,
+)  # fmt: skip
 SH_C4: Final = (
-    2.5033429417967046,
-    -1.7701307697799304,
-    0.9461746957575601,
-    -0.6690465435572892,
-    0.10578554691520431,
-    -0.6690465435572892,
-    0.47308734787878004,
-    -1.7701307697799304,
-    0.6258357354491761,
-)
+    2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
+    -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761,
+)  # fmt: skip
 MAX_SH_DEGREE: Final = 4
 
 # --- exp2 and log2 ----------------------------------------------------------------------------
@@ -185,7 +171,6 @@ CODE_LIMIT: Final = 1 << 24  # Largest magnitude of a code: float32 holds all of
 # --- method (FlexGaussian, ACM MM 2025) -------------------------------------------------------
 VOLUME_POWER: Final = 0.1  # Exponent of the Gaussian's volume in the gs and meson scores
 GROUP_ROWS: Final = 512  # Rows of a quantization group. The paper's 1000 groups take 528 kB for any number of rows.
-DEFAULT_BASE_PSNR: Final = 34.0
-"""Assumed PSNR in dB of a model against its photos, for views whose photo cannot judge."""
+DEFAULT_BASE_PSNR: Final = 34.0  # Assumed PSNR in dB of a model against its photos, for views whose photo cannot judge
 DEFAULT_HOLDOUT: Final = 8  # Every 8th view by name is held out, the field's convention since Mip-NeRF 360
 MAX_VIEW_WIDTH: Final = 1600  # Wider views are scaled down to this width, as in the reference training program

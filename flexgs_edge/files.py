@@ -1,8 +1,6 @@
 """Check files before they are read, and write results so that each gets its name only when it is complete."""
 
-from __future__ import annotations
-
-import errno
+import json
 import os
 import secrets
 import shutil
@@ -10,12 +8,9 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from flexgs_edge.errors import BudgetError, InputError
-
-DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-
+from flexgs_edge.errors import DISK_FULL, BudgetError, FormatError, InputError, brief
 
 _SPECIAL = {
     stat.S_IFIFO: "a pipe",
@@ -46,6 +41,18 @@ def check_readable(path: str | os.PathLike[str], name: str | None = None) -> Non
     if kind != stat.S_IFREG:
         found = _SPECIAL.get(kind, "a special file")
         raise InputError(f"{name}: expected a file, found {found}; write what it holds to a file first")
+
+
+def parse_json(text: bytes, name: object) -> Any:
+    """The value of a JSON text, which messages call `name`. Raises `FormatError` if it is not JSON."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise FormatError(
+            f"{name}: not JSON: {error.msg} in line {error.lineno}, column {error.colno}; is it complete?"
+        ) from error
+    except (RecursionError, ValueError) as error:  # also bytes that are no text, and numbers of absurd length
+        raise FormatError(f"{name}: not JSON: {brief(str(error))}") from error
 
 
 def check_writable(path: str | os.PathLike[str], force: bool = False) -> Path:
@@ -86,10 +93,7 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
             yield file
         os.replace(temporary, target)
     except OSError as error:
-        if error.errno in DISK_FULL:
-            raise BudgetError(
-                f"{path}: the disk is full ({error.strerror}); free some space or write elsewhere"
-            ) from error
+        _check_disk(path, error)
         # Other errors in the block, such as of files that it reads, are not explained here.
         if error.filename is not None and os.fspath(error.filename) == os.fspath(temporary):
             raise InputError(f"{path}: cannot write there ({error.strerror})") from error
@@ -97,6 +101,12 @@ def atomic_write(path: str | os.PathLike[str], force: bool = False) -> Iterator[
     finally:
         with suppress(FileNotFoundError):
             temporary.unlink()
+
+
+def _check_disk(path: object, error: OSError) -> None:
+    """Raise `BudgetError` if an error says that the disk is full."""
+    if error.errno in DISK_FULL:
+        raise BudgetError(f"{path}: the disk is full ({error.strerror}); free some space or write elsewhere") from error
 
 
 def check_folder(path: str | os.PathLike[str], force: bool = False) -> Path:
@@ -140,10 +150,7 @@ def atomic_folder(path: str | os.PathLike[str], force: bool = False) -> Iterator
         else:
             os.rename(place, target)
     except OSError as error:
-        if error.errno in DISK_FULL:
-            raise BudgetError(
-                f"-o {path}: the disk is full ({error.strerror}); free some space or write elsewhere"
-            ) from error
+        _check_disk(f"-o {path}", error)
         raise
     finally:
         shutil.rmtree(place, ignore_errors=True)

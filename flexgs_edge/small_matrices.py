@@ -1,10 +1,11 @@
-"""Products and inverses of small matrices, with the same bits on every processor.
+"""Products and inverses of small matrices, and quaternions, with the same bits on every processor.
 
 BLAS, behind `@` and `numpy.linalg`, adds in another order on other processors. One bit of a camera's place can decide which of
 two equally near neighbours it has, and with it every byte of a file.
 """
 
-from __future__ import annotations
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,7 @@ def product(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
     >>> product(np.array([[0.0, 2.0], [1.0, 0.0]]), np.array([3.0, 4.0]))
     array([8., 3.])
     """
-    found: np.ndarray = sum(
-        matrix[:, k].reshape(-1, *[1] * (columns.ndim - 1)) * columns[k][None] for k in range(len(columns))
-    )
-    return found
+    return sum(matrix[:, k].reshape(-1, *[1] * (columns.ndim - 1)) * columns[k][None] for k in range(len(columns)))
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
@@ -48,3 +46,28 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
         if not np.abs(found - before).max() > _SMALL_STEP:
             break
     return found
+
+
+def rotation_matrix(quats: Sequence[Any] | np.ndarray) -> np.ndarray:
+    """[3, 3, ...] f64, rotation matrices of unit quaternions w x y z ([4, ...])."""
+    w, x, y, z = quats
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[4, ...], products of quaternions w x y z ([4, ...])."""
+    (w, x, y, z), (bw, bx, by, bz) = first, second
+    return np.stack(
+        [
+            (w * bw - x * bx) - (y * by + z * bz),
+            (w * bx + x * bw) + (y * bz - z * by),
+            (w * by - x * bz) + (y * bw + z * bx),
+            (w * bz + x * by) - (y * bx - z * bw),
+        ]
+    )

@@ -1,7 +1,5 @@
 """Read and write sizes in bytes with units, such as `8MB` and `1.5 GiB`."""
 
-from __future__ import annotations
-
 import re
 
 from flexgs_edge.errors import InputError

@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--force", action="store_true", help="replace an earlier page")
     words = vars(parser.parse_args())
     scene, output = words.pop("scene"), words.pop("output")
-    print(study_paper(scene, output, CompressOptions(**words), Progress()).to_text(), end="")
+    print(study_paper(scene, output, CompressOptions(**words), Progress()).summary(), end="")
 
 
 if __name__ == "__main__":

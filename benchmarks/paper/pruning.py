@@ -11,7 +11,7 @@ from benchmarks.paper.scene import Point, Setting, StudyScene, beside
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, Series
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns, number
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns, number
 
 DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.
 GRID = 100  # Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid.

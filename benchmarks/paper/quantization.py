@@ -6,11 +6,11 @@ from dataclasses import replace
 
 from benchmarks.paper.charts import DotChart
 from benchmarks.paper.scene import Setting, StudyScene
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.report.plots import BarChart, LineChart, Series
-from flexgs_edge.run.plan import EVERYTHING
+from flexgs_edge.run.run import EVERYTHING
 from flexgs_edge.scene.fields import FIELDS
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns
 
 RTN_BITS = tuple(range(2, 9))
 FINE = BitSpec.rtn(16)  # Stands for unquantized values: 16 bits in sub-groups lose less than renders show

@@ -15,21 +15,19 @@ import numpy as np
 
 from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import Measurement, Target
-from flexgs_edge.methods.paper.evaluator import Ranked, SceneEvaluator
+from flexgs_edge.methods.paper.method import Ranked, SceneEvaluator, score_scene
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores
-from flexgs_edge.methods.paper.scores import score_scene
 from flexgs_edge.methods.paper.search import adapt
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.progress import Progress
-from flexgs_edge.quality.psnr import error_for_drop
+from flexgs_edge.quality.psnr import mse_of_psnr
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.plan import EVERYTHING, Plan
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
-from flexgs_edge.run.run import Run, open_run, planned
+from flexgs_edge.run.run import EVERYTHING, Plan, Run, open_run, planned
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.studies.result_tables import Cell, figures
+from flexgs_edge.studies.written import Cell, figures
 
 LOG = logging.getLogger("flexgs_edge")
 
@@ -161,7 +159,7 @@ class StudyScene:
 
     def error(self, point: Point) -> float:
         """Mean squared error against the original's renders, averaged over the views."""
-        return error_for_drop(point.measurement.modelled_drop, self.judge.base_psnr)
+        return mse_of_psnr(self.judge.base_psnr) * (float(10.0 ** (point.measurement.modelled_drop / 10.0)) - 1.0)
 
 
 class _Remembering:

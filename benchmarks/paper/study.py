@@ -15,8 +15,7 @@ from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_renderer import drawn_info
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.view_set import views_info
-from flexgs_edge.studies.result_tables import Experiment
-from flexgs_edge.studies.written import SceneStudy, Study, scene_name, write_study
+from flexgs_edge.studies.written import Experiment, SceneStudy, Study, scene_name, write_study
 
 LOG = logging.getLogger("flexgs_edge")
 

@@ -14,10 +14,10 @@ from flexgs_edge.goals.target import Measurement, min_ratio
 from flexgs_edge.memory.process import peak_rss
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.report.plots import BarChart, LineChart, Series
-from flexgs_edge.run.plan import EVERYTHING
 from flexgs_edge.run.quality_evaluator import measurement_of
+from flexgs_edge.run.run import EVERYTHING
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)  # The strongest compression that the search may choose

@@ -1,7 +1,5 @@
 """An open `.fgs` file: its header, its layers, its checksums."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Types of the Python API: paths, arrays, and the options of `compress`."""
 
-from __future__ import annotations
-
 import os
 from typing import Any, TypedDict
 
@@ -19,18 +17,12 @@ class Arrays(TypedDict):
     `means` is float64 if the scene lies far from zero; otherwise all arrays are float32.
     """
 
-    means: Numbers
-    """[N, 3], world coordinates."""
-    log_scales: Floats
-    """[N, 3], natural logarithms of the standard deviations."""
-    quats: Floats
-    """[N, 4], w x y z, any norm."""
-    opacity_logits: Floats
-    """[N], opacities before the sigmoid."""
-    sh_dc: Floats
-    """[N, 3], SH of degree 0."""
-    sh_rest: Floats
-    """[N, K, 3], SH above degree 0. K is 0, 3, 8, 15 or 24 at SH degree 0 to 4."""
+    means: Numbers  # [N, 3], world coordinates
+    log_scales: Floats  # [N, 3], natural logarithms of the standard deviations
+    quats: Floats  # [N, 4], w x y z, any norm
+    opacity_logits: Floats  # [N], opacities before the sigmoid
+    sh_dc: Floats  # [N, 3], SH of degree 0
+    sh_rest: Floats  # [N, K, 3], SH above degree 0. K is 0, 3, 8, 15 or 24 at SH degree 0 to 4.
 
 
 class CompressWords(TypedDict, total=False):
@@ -70,6 +62,8 @@ class CompressWords(TypedDict, total=False):
     groups: int | None
     base_psnr: float | None
     trust_views: bool
+    clean: str | None
+    keep_removed: str | None
     effort: str
     best_effort: bool
     unseen: str

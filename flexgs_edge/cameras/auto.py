@@ -1,15 +1,13 @@
 """Place cameras automatically around a scene that has none: where people stand, so that the Gaussians are seen as in training.
 
-Candidates are drawn small, and their pictures judge them. A view is good where the Gaussians that it shows are as fine as those
-around them (`detail`), fill the picture, and do not hang right before the lens. SH above degree 0, where there are any, grow only
-along directions that cameras looked from. Views are picked one by one for what they add, until they show what all good views
-together show. So their number follows from the scene.
+Candidates stand in lattices in and around the scene. They are drawn small, and their pictures judge them. A view is good where
+the Gaussians that it shows are as fine as those around them (`detail`), fill the picture, and do not hang right before the
+lens. SH above degree 0, where there are any, grow only along directions that cameras looked from. Views are picked one by one
+for what they add, until they show what all good views together show. So their number follows from the scene.
 
 The same scene gets the same cameras on any machine. What exponentials and powers yield is rounded to whole numbers
 before it is added or compared, and no sum depends on the order of its terms.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -20,15 +18,13 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.candidates import MOST_VIEWS, Candidate, Show, Stage, look
-from flexgs_edge.cameras.directions import Frames
-from flexgs_edge.cameras.places import first_places
-from flexgs_edge.cameras.scene_sample import Gaussians, SceneSample, sample_scene
+from flexgs_edge.cameras.directions import Frames, fibonacci
+from flexgs_edge.cameras.scene_sample import Gaussians, Part, SceneSample, sample_scene
 from flexgs_edge.cameras.up import Stands, find_up, given_up
 from flexgs_edge.errors import InputError
 
 LEAST_VIEWS = 40
-PIXELS = 24
-"""Least pixels of all views for a Gaussian, up to MOST_VIEWS: fewer cannot tell what each is worth."""
+PIXELS = 24  # Least pixels of all views for a Gaussian, up to MOST_VIEWS: fewer cannot tell what each is worth
 DEFAULT_SIZE = (640, 480)
 FIELD_OF_VIEW = math.radians(65.0)
 """Angle of view across the image's width; lenses of phones, and those usual in the field, have 40 to 70 degrees. Wide
@@ -40,10 +36,18 @@ ROUNDS, BEST = 2, 20
 """So often the best views, so many in the same proportion, get others beside them, and half as many Gaussians that none of them
 shows well get places around them."""
 DIRECTIONS = 192
-NEAR_PLANE = 0.1
-"""A near plane up to this share of the usual distance leaves what is looked at."""
+NEAR_PLANE = 0.1  # A near plane up to this share of the usual distance leaves what is looked at
 Drawing = Callable[[dict[str, np.ndarray]], AbstractContextManager[Show]]
 """Draws a small scene, {field: [width, M] f32}."""
+MARGIN = 1.2  # A lattice reaches so many half sides of its box to each side
+WIDER = (1, 2, 4)
+"""Lattices of a core, in half sides of its box. Cameras often stood outside the dense core that they looked at."""
+BETWEEN = 1.5  # Wider lattices end where they come this near to the size of the whole scene
+CLOSE_UPS = 24  # Splats that get places of their own, if the scene is sparse
+CLOSE_SIDES = 4  # Places around each of them
+CLOSE_DISTANCE = 5.5
+"""Distance of these places in deviations of the splat. Three deviations to each side then fill the frame."""
+SPARSE = 0.5  # A scene is sparse if all its cross-sections together are less than this share of a circle around its box
 
 
 @dataclass(frozen=True)
@@ -121,3 +125,51 @@ def _placed(scene: SceneSample, places: np.ndarray) -> str:
     kind = "inside out" if inside > 0.75 else "from outside" if inside < 0.25 else "from inside and outside"
     told = ", and SH are strong" if scene.telling.size else ""
     return f"{places.shape[1]} automatic views {kind}, placed where the scene looks sharp{told}"
+
+
+def first_places(scene: SceneSample, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """About `count` candidates in and around the parts of a scene.
+
+    Returns positions relative to the scene's origin ([3, P] f64), and distances to the next ones ([P] f64, scene units).
+    """
+    boxes = _boxes(scene.parts)
+    found = [_lattice(box, count / len(boxes)) for box in boxes]
+    if is_sparse(scene):
+        found.append(_close_ups(scene))
+    return np.concatenate([at for at, _ in found], axis=1), np.concatenate([step for _, step in found])
+
+
+def is_sparse(scene: SceneSample) -> bool:
+    """Say if a view of the whole scene would be almost empty."""
+    return scene.area < SPARSE * scene.whole.extent**2
+
+
+def _boxes(parts: list[Part]) -> list[Part]:
+    boxes = [parts[0]]
+    for part in parts[1:]:
+        for factor in WIDER:
+            wider = Part(part.middle, part.half * factor)
+            if factor == 1 or wider.extent * BETWEEN < parts[0].extent:
+                boxes.append(wider)
+    return boxes
+
+
+def _lattice(box: Part, count: float) -> tuple[np.ndarray, np.ndarray]:
+    """A cubic lattice of about `count` places in and around a box."""
+    reach = (1 + MARGIN) * np.maximum(box.half, 0.25 * box.half.max())
+    step = 2 * float(np.cbrt(reach.prod() / count))
+    axes = []
+    for half in reach:
+        sides = max(1, round(2 * float(half) / step))
+        axes.append((np.arange(sides) + 0.5) * (2 * float(half) / sides) - float(half))
+    at = np.stack(np.meshgrid(*axes, indexing="ij")).reshape(3, -1) + box.middle[:, None]
+    return at, np.full(at.shape[1], step)
+
+
+def _close_ups(scene: SceneSample) -> tuple[np.ndarray, np.ndarray]:
+    """Places around the splats that show most."""
+    order = np.argsort(-scene.sample.opacity * scene.sample.sizes**2, kind="stable")[:CLOSE_UPS]
+    distances = CLOSE_DISTANCE * scene.sample.sizes[order]
+    offsets = fibonacci(CLOSE_SIDES).T
+    at = scene.sample.means[:, order, None] + distances[:, None] * offsets[:, None]
+    return at.reshape(3, -1), np.repeat(distances / math.sqrt(CLOSE_SIDES), CLOSE_SIDES)

@@ -1,7 +1,5 @@
 """Candidates for automatic views: what each shows, what it is worth, and which of them are needed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,28 +15,20 @@ from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 MOST_VIEWS = 400
 SHOWN = 0.98
 """Views are enough when they show this share of all Gaussians that good views show, all together as well as the best of these."""
-SIDE = 80
-"""Pixels along the side of a candidate's picture, a square of the same area as the view."""
-LEAST_ANGLE = 0.002
-"""A Gaussian is shown well if its deviation is this, radians: a pixel of a view 640 wide."""
-LOOKED_AT = 40.0, 20.0, 10.0
-"""Distances of the places around one that is not, in its deviations."""
-LINES = 3
-"""Most directions of view from a place."""
-TURNED = math.cos(math.radians(40.0))
-"""Directions of view from one place differ by more than this."""
+SIDE = 80  # Pixels along the side of a candidate's picture, a square of the same area as the view
+LEAST_ANGLE = 0.002  # A Gaussian is shown well if its deviation is this, radians: a pixel of a view 640 wide
+LOOKED_AT = 40.0, 20.0, 10.0  # Distances of the places around one that is not, in its deviations
+LINES = 3  # Most directions of view from a place
+TURNED = math.cos(math.radians(40.0))  # Directions of view from one place differ by more than this
 SMEAR, SMEAR_FREE = 0.03, 0.1
 """Views count e times less for each step by which Gaussians are wider than those around them, in the mean of logs, beyond what
 the sharpest tenth shows and what is free. Real cameras' views lie within .1 of each other, those from behind and from below .2
 beyond."""
-BLURRED_TIMES = 2.0
-"""What is free for the width of splats in the view, a factor."""
+BLURRED_TIMES = 2.0  # What is free for the width of splats in the view, a factor
 LEAST_SHARP, LEAST_WORTH = 0.1, 1e-4
 """Views that count less than this for what is too wide in them, or in all, are not taken at all."""
-GOOD = 0.1
-"""Views are enough when they show what views show that are worth this share of the best, or more."""
-DECIDING = 0.3
-"""Views that are worth less than this share of the best do not decide."""
+GOOD = 0.1  # Views are enough when they show what views show that are worth this share of the best, or more
+DECIDING = 0.3  # Views that are worth less than this share of the best do not decide
 NEW, LEAST_NEW, NEW_SHARP = 0.5, 0.001, 0.3
 """Views that show at least the second share of the Gaussians, of which all others together show less than the first share of what
 can be shown of them, are taken however little they are worth, if they count so much for what is too wide in them."""
@@ -50,20 +40,16 @@ than WIDE. Views count by this power of the share of all other light."""
 WIDE = 0.1
 ENCLOSED_POWER = 1
 """Places with matter on more than half of all sides count by this power of it: inside a room, not behind its walls."""
-SHARP = 0.008
-"""Usual deviation of a splat over its distance from a camera (4 pixels in a view 640 wide)."""
+SHARP = 0.008  # Usual deviation of a splat over its distance from a camera (4 pixels in a view 640 wide)
 SHARP_SPREAD = math.log(8.0)
 """One standard deviation of its logarithm. It is wide, since scenes of few large splats are seen from the same
 distance."""
 AGREEMENT_POWER = 2
-APART = 0.1
-"""Views nearer to each other than this share of the distance of what they show add less."""
+APART = 0.1  # Views nearer to each other than this share of the distance of what they show add less
 FILLED, FILLED_POWER = 0.3, 2
 """Views that matter fills less than this, or less than the usual good one, count by this power of how much less."""
-FARTHEST = 1e9
-"""Candidates farther away, in extents of the smallest part, are left out: float32 must hold them."""
-UNITS = 2.0**20
-"""Merits and wants are whole numbers up to this. The sum of their products is exact in float64."""
+FARTHEST = 1e9  # Candidates farther away, in extents of the smallest part, are left out: float32 must hold them
+UNITS = 2.0**20  # Merits and wants are whole numbers up to this. The sum of their products is exact in float64.
 
 Show = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
 """Draws a view: the rows that it shows ([m] int64), and the sum of alpha T over the pixels for each ([m] f64)."""
@@ -315,8 +301,7 @@ def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _close(angles: np.ndarray) -> np.ndarray:
     """[n] f64, 0 to 1, how well deviations over distances suit a view."""
     off = (np.log(np.maximum(angles, 1e-300)) - math.log(SHARP)) / SHARP_SPREAD
-    found: np.ndarray = np.exp(-0.5 * np.minimum(off * off, 1000.0))
-    return found
+    return np.exp(-0.5 * np.minimum(off * off, 1000.0))
 
 
 def _middle(lines: np.ndarray, amounts: np.ndarray, line: np.ndarray) -> np.ndarray:
@@ -328,8 +313,7 @@ def _middle(lines: np.ndarray, amounts: np.ndarray, line: np.ndarray) -> np.ndar
 
 def _along(line: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Cosines between a direction ([3]) and others ([3, ...])."""
-    found: np.ndarray = line[0] * lines[0] + line[1] * lines[1] + line[2] * lines[2]
-    return found
+    return line[0] * lines[0] + line[1] * lines[1] + line[2] * lines[2]
 
 
 def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:

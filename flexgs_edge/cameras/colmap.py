@@ -1,7 +1,5 @@
 """Read cameras and images of COLMAP's sparse models, binary or text; the points are not needed."""
 
-from __future__ import annotations
-
 import math
 import os
 import struct
@@ -16,6 +14,7 @@ from flexgs_edge.cameras.camera import Camera, distinct_names
 from flexgs_edge.cameras.json_values import MAX_SIDE
 from flexgs_edge.cameras.lens import Lens
 from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.small_matrices import rotation_matrix
 
 
 @dataclass(frozen=True)
@@ -165,14 +164,7 @@ def _rotation(place: str, quaternion: Sequence[float]) -> np.ndarray:
     norm = math.hypot(*quaternion)
     if not abs(norm - 1) <= QUATERNION_TOLERANCE:
         raise FormatError(f"{place}: rotation: expected a unit quaternion, found one of norm {norm:.4g}")
-    w, x, y, z = (value / norm for value in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_matrix([value / norm for value in quaternion])
 
 
 def _lens(place: str, model: Model, width: int, height: int, parameters: tuple[float, ...]) -> _Lens:

@@ -1,7 +1,5 @@
 """Cameras as they would be if their file were meant in another convention, to name the one that fits a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations, product

@@ -4,18 +4,13 @@ Where cameras stood, a trained scene shows fine Gaussians, as fine as the pictur
 ones that no picture corrected. So whoever sees many that are wider than those around them stands where no camera stood.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 AROUND = 4.0
 """Side of the box around a Gaussian, in its own deviations, within which others tell how wide is usual there."""
-WIDEST = 1.5
-"""Logs above this count as this: how much wider a sky is than what stands before it tells nothing."""
-BITS = 21
-"""Bits of a position along each axis of the curve."""
-UNITS = 2.0**16
-"""Logarithms are whole numbers of 1 / UNITS, so that their sums do not depend on the order."""
+WIDEST = 1.5  # Logs above this count as this: how much wider a sky is than what stands before it tells nothing
+BITS = 21  # Bits of a position along each axis of the curve
+UNITS = 2.0**16  # Logarithms are whole numbers of 1 / UNITS, so that their sums do not depend on the order
 
 
 def smears(means: np.ndarray, sizes: np.ndarray, low: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:

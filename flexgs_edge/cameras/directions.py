@@ -1,13 +1,10 @@
 """Directions of view from a place, and sums over what lies within a frame around each."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
-FACE = 16
-"""Bins along the side of each face of a cube of directions: 7 degrees or less each."""
+FACE = 16  # Bins along the side of each face of a cube of directions: 7 degrees or less each
 BINS = 6 * FACE * FACE
 
 
@@ -26,8 +23,7 @@ def bins_of(lines: np.ndarray) -> np.ndarray:
     major, first, second = (np.choose((axis + turn) % 3, lines) for turn in range(3))
     size = np.maximum(np.abs(major), 1e-300)
     row, column = (np.minimum((part / size + 1) * (FACE / 2), FACE - 1).astype(np.int64) for part in (first, second))
-    found: np.ndarray = ((axis * 2 + (major < 0)) * FACE + row) * FACE + column
-    return found
+    return ((axis * 2 + (major < 0)) * FACE + row) * FACE + column
 
 
 def filled_share(bins: np.ndarray) -> float:
@@ -59,14 +55,12 @@ class Frames:
     def sums(self, bins: np.ndarray, amounts: np.ndarray) -> np.ndarray:
         """[D] f64, the sum of `amounts` ([n] f64) in the frame around each direction; `bins` is [n] int64."""
         total = np.bincount(bins, amounts, BINS + 1)
-        found: np.ndarray = total[self._bins].sum(axis=1)
-        return found
+        return total[self._bins].sum(axis=1)
 
     def holds(self, direction: np.ndarray, lines: np.ndarray) -> np.ndarray:
         """[n] bool, the unit vectors ([3, n]) in the frame around a direction ([3])."""
         x, y, z = direction
-        inside: np.ndarray = x * lines[0] + y * lines[1] + z * lines[2] > self.limit
-        return inside
+        return x * lines[0] + y * lines[1] + z * lines[2] > self.limit
 
 
 def _bin_centres() -> np.ndarray:

@@ -1,7 +1,5 @@
 """Generate camera poses from given ones: closer, farther, and in between."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

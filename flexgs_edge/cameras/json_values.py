@@ -1,8 +1,5 @@
 """Check values of JSON camera files; error messages name the file, the entry and the key."""
 
-from __future__ import annotations
-
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.errors import FormatError, InputError, brief
+from flexgs_edge.files import parse_json
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of |R R^T - 1|. Files keep 6 digits or more; a scaled or sheared matrix is off by far more."""
@@ -17,19 +15,16 @@ MAX_SIDE = 65535  # Most pixels of a side; a larger number means a damaged file 
 _SHOWN = 20  # Most keys in a message
 
 
-def load_json(path: Path) -> Any:
-    """Load the value of a JSON file.
+def load_json(path: Path, what: str = "the cameras") -> Any:
+    """Load the value of a JSON file, which messages call `what`.
 
     Raises `InputError` if the file cannot be read. Raises `FormatError` if it is not JSON.
     """
     try:
-        return json.loads(path.read_bytes())
+        text = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot read the cameras ({error.strerror})") from error
-    except json.JSONDecodeError as error:
-        raise FormatError(f"{path}: not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
-    except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise FormatError(f"{path}: not JSON: {error}") from error
+        raise InputError(f"{path}: cannot read {what} ({error.strerror})") from error
+    return parse_json(text, path)
 
 
 def kind(value: Any) -> str:

@@ -1,7 +1,5 @@
 """Lens distortion: OpenCV's polynomial and its fisheye, and photos without it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

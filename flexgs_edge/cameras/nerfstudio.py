@@ -1,7 +1,5 @@
 """What nerfstudio writes of a training: the frame of its scene, and the list of poses of `ns-export cameras`."""
 
-from __future__ import annotations
-
 import glob
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Order cameras so that the first ones of any number cover the whole scene, by what they see."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -82,8 +80,7 @@ def squared_distances(cameras: Sequence[Camera], others: Sequence[Camera]) -> np
     def places(views: Sequence[Camera]) -> np.ndarray:
         return np.stack([np.concatenate([camera.center / spread, camera.rotation[2]]) for camera in views])
 
-    found: np.ndarray = np.square(places(cameras)[:, None] - places(others)[None]).sum(axis=2)
-    return found
+    return np.square(places(cameras)[:, None] - places(others)[None]).sum(axis=2)
 
 
 def nearest(camera: Camera, others: Sequence[Camera], count: int) -> list[int]:

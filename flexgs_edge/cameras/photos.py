@@ -293,5 +293,4 @@ def _colours(pixels: np.ndarray, background: np.ndarray) -> np.ndarray:
     if colours.shape[2] == 3:
         return colours
     alpha = colours[:, :, 3:]
-    blended: np.ndarray = colours[:, :, :3] * alpha + background * (1.0 - alpha)
-    return blended
+    return colours[:, :, :3] * alpha + background * (1.0 - alpha)

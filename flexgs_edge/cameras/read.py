@@ -1,7 +1,5 @@
 """Read a camera file of any supported kind; the cameras are sorted by name."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -24,21 +22,14 @@ SUPPORTED = (
 )
 
 
-def read_inria(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read INRIA's cameras.json in the file's order.
+def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
+    """Cameras of the list in INRIA's cameras.json, in its order.
 
     The file has no principal point, so it is the middle of the image: (W - 1) / 2, with integer pixel centres.
     The reference program drops folders and what follows the first dot from names: equal ones get `#` and their place.
 
-    Raises `InputError` if the file cannot be read. Raises `FormatError` if it is not JSON, not a list, empty, or an
-    entry is wrong; the message names file, entry and field.
+    Raises `FormatError` if it is not a list, empty, or an entry is wrong; the message names file, entry and field.
     """
-    path = Path(path)
-    return cameras_of_list(path, load_json(path))
-
-
-def cameras_of_list(path: Path, entries: Any) -> list[Camera]:
-    """`read_inria` for JSON that is loaded already."""
     if not isinstance(entries, list):
         hint = "; this looks like a NeRF transforms.json" if isinstance(entries, dict) and "frames" in entries else ""
         raise FormatError(f"{path}: expected a JSON list of cameras, found {kind(entries)}{hint}")

@@ -14,33 +14,22 @@ import numpy as np
 
 from flexgs_edge.cameras.detail import few_rows, smears
 from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
+from flexgs_edge.small_matrices import rotation_matrix
 
-SAMPLE_ROWS = 1 << 15
-"""Rows for parts and ground."""
-READ_ROWS = 1 << 23
-"""Most rows that are compared with those around them. Of more, every k-th is."""
-CHUNK_ROWS = 1 << 18
-"""Rows that are read together."""
-DRAWN_ROWS = 1 << 15
-"""Rows that are drawn, about; see `drawn_rows`."""
-TELLING_ROWS = 1200
-"""Rows whose SH tell directions."""
-BOX_REACH = 20.0
-"""Beyond so many half sides of the box of the first part, nothing is told apart."""
-BULK = (0.05, 0.95)
-"""Quantiles of the positions for the middle and the box of a part."""
-OWN_SIZE = 2.0
-"""The box of a part reaches so many usual deviations beyond its positions: a single splat has a box too."""
+SAMPLE_ROWS = 1 << 15  # Rows for parts and ground
+READ_ROWS = 1 << 23  # Most rows that are compared with those around them. Of more, every k-th is.
+CHUNK_ROWS = 1 << 18  # Rows that are read together
+DRAWN_ROWS = 1 << 15  # Rows that are drawn, about; see `drawn_rows`
+TELLING_ROWS = 1200  # Rows whose SH tell directions
+BOX_REACH = 20.0  # Beyond so many half sides of the box of the first part, nothing is told apart
+BULK = (0.05, 0.95)  # Quantiles of the positions for the middle and the box of a part
+OWN_SIZE = 2.0  # The box of a part reaches so many usual deviations beyond its positions: a single splat has a box too
 SMALLER = 0.5
 """The core is the half of the matter that is nearest to the middle, if its box is smaller than this share of the whole."""
-RESTS = 3
-"""So often we look for a cluster in what remains outside a core."""
-APART = 3.0
-"""A cluster is a part of its own if it is so many times farther from all others than their extents together."""
-PRECISION = 1e-5
-"""Smallest half side of a box over its distance from the origin: float32 positions have 7 digits."""
-SH_FLOOR = 0.01
-"""Rows with a weaker view-dependent colour, on average, do not tell directions."""
+RESTS = 3  # So often we look for a cluster in what remains outside a core
+APART = 3.0  # A cluster is a part of its own if it is so many times farther from all others than their extents together
+PRECISION = 1e-5  # Smallest half side of a box over its distance from the origin: float32 positions have 7 digits
+SH_FLOOR = 0.01  # Rows with a weaker view-dependent colour, on average, do not tell directions
 OPAQUE = 0.5
 """Where all opacities are less, they are raised until the largest is this: faint scenes are to be seen, too."""
 
@@ -119,8 +108,7 @@ class SceneSample:
         lines = self.means[:, self.telling] - eye[:, None]
         lines /= np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-300)
         basis = sh_basis(lines, self.sh.shape[1])
-        strength: np.ndarray = np.minimum(np.sqrt(np.square((self.sh * basis).sum(axis=1)).sum(axis=0)), 3.0)
-        return strength
+        return np.minimum(np.sqrt(np.square((self.sh * basis).sum(axis=1)).sum(axis=0)), 3.0)
 
 
 def sample_scene(source: Gaussians) -> SceneSample:
@@ -173,20 +161,17 @@ def sample_scene(source: Gaussians) -> SceneSample:
 
 def _logs(planes: dict[str, np.ndarray]) -> np.ndarray:
     # Clipped well inside float64's exponents, so that squares and products stay finite.
-    logs: np.ndarray = np.clip(planes["log_scales"].astype(np.float64), -40, 40)
-    return logs
+    return np.clip(planes["log_scales"].astype(np.float64), -40, 40)
 
 
 def _opacities(planes: dict[str, np.ndarray]) -> np.ndarray:
-    opacity: np.ndarray = 1 / (1 + np.exp(-np.clip(planes["opacity_logits"][0].astype(np.float64), -60, 40)))
-    return opacity
+    return 1 / (1 + np.exp(-np.clip(planes["opacity_logits"][0].astype(np.float64), -60, 40)))
 
 
 def _sizes(deviations: np.ndarray) -> np.ndarray:
     a, b, c = deviations
     least = np.minimum(np.minimum(a, b), c)
-    sizes: np.ndarray = np.sqrt(a / least * b * c)
-    return sizes
+    return np.sqrt(a / least * b * c)
 
 
 def find_parts(means: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> list[Part]:
@@ -246,18 +231,8 @@ def weighted_quantiles(values: np.ndarray, weights: np.ndarray, shares: Sequence
 
 
 def rotations(quats: np.ndarray) -> np.ndarray:
-    """[3, 3, n] f64, rotation matrices of quaternions w x y z ([4, n], any norm but zero).
-
-    Columns are the splat's axes.
-    """
-    w, x, y, z = quats / np.linalg.norm(quats.astype(np.float64), axis=0)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """[3, 3, n] f64, rotation matrices of quaternions w x y z ([4, n], any norm but zero). Columns are the splat's axes."""
+    return rotation_matrix(quats / np.linalg.norm(quats.astype(np.float64), axis=0))
 
 
 def _directions(source: Gaussians, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

@@ -13,16 +13,12 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.up import unit
 from flexgs_edge.small_matrices import product
 
-START = "start"
-"""Name of the view in the settings of a file."""
-PLACE_DIGITS = 9
-"""Significant digits of places, which may lie far from zero."""
-FARTHEST = 1e15
-"""Numbers of a file beyond this are no places."""
+START = "start"  # Name of the view in the settings of a file
+PLACE_DIGITS = 9  # Significant digits of places, which may lie far from zero
+FARTHEST = 1e15  # Numbers of a file beyond this are no places
 SAME_PLACE = 1e-6
 """Cameras stand in one place if they differ by less than this share of its coordinates, which have `PLACE_DIGITS`."""
-LEVEL_MOST = 0.99
-"""Cosine of the direction of view and up. Beyond, the picture's own up is taken."""
+LEVEL_MOST = 0.99  # Cosine of the direction of view and up. Beyond, the picture's own up is taken.
 LEVEL = 0.1
 """Variance of the pictures' horizontal axes along up over that along the next direction: what is more has no common up."""
 
@@ -109,8 +105,7 @@ def _depths_shown(camera: Camera, positions: np.ndarray) -> np.ndarray:
     inside = (np.abs(column - (camera.width - 1) / 2) <= camera.width / 2) & (
         np.abs(row - (camera.height - 1) / 2) <= camera.height / 2
     )
-    shown: np.ndarray = z[inside]
-    return shown
+    return z[inside]
 
 
 def _is_place(value: Any) -> bool:

@@ -8,7 +8,6 @@ exported PLY.
 from __future__ import annotations
 
 import math
-import os
 import posixpath
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -31,28 +30,19 @@ BENT = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Values of `camera_model` that are pinholes if their parameters are zero."""
 
 
-def read_transforms(
-    path: str | os.PathLike[str], ignore_distortion: bool = False, dataparser: Path | None = None
+def cameras_of_frames(
+    path: Path, value: Any, ignore_distortion: bool = False, dataparser: Path | None = None
 ) -> list[Camera]:
-    """Read a transforms.json in the file's order.
+    """Cameras of the JSON of a transforms.json, in its order.
 
     Names are the frames' `file_path`, without the folder that all of them share. Pixel centres of the file lie at
     integer + 0.5, so half a pixel is subtracted from the principal point; by default it is the image's middle. If the
     size is missing, it is taken from the frame's photo (`file_path` with or without extension).
 
-    `path`: the file. `ignore_distortion`: take the poses of distorted lenses as pinholes; such cameras cannot be
-    compared with photos. `dataparser`: a `dataparser_transforms.json`. Default: the one that is found. Raises
-    `InputError` if the file cannot be read, or a size is not found. Raises `FormatError` if the file breaks its format;
-    the message names file, frame and key.
+    `ignore_distortion`: take the poses of distorted lenses as pinholes; such cameras cannot be compared with photos.
+    `dataparser`: a `dataparser_transforms.json`. Default: the one that is found. Raises `InputError` if a size is not
+    found. Raises `FormatError` if the file breaks its format; the message names file, frame and key.
     """
-    path = Path(path)
-    return cameras_of_frames(path, load_json(path), ignore_distortion, dataparser)
-
-
-def cameras_of_frames(
-    path: Path, value: Any, ignore_distortion: bool = False, dataparser: Path | None = None
-) -> list[Camera]:
-    """`read_transforms` for JSON that is loaded already."""
     top = Entry(str(path), value)
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:

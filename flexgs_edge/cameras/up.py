@@ -5,8 +5,6 @@ they are clear. People walk around a thing more than they climb: cameras all aro
 normal. And a ground is one large flat surface with the rest of the scene on one side. Up need not be an axis.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -15,50 +13,32 @@ import numpy as np
 from flexgs_edge.cameras.directions import Frames, bins_of
 from flexgs_edge.cameras.scene_sample import SceneSample, Splats
 
-CONVENTION = (0.0, -1.0, 0.0)
-"""Up in COLMAP's frame."""
-RING_POWER = 4
-"""A place counts by this power of what it shows: places near the training cameras show far more."""
+CONVENTION = (0.0, -1.0, 0.0)  # Up in COLMAP's frame
+RING_POWER = 4  # A place counts by this power of what it shows: places near the training cameras show far more
 RING_FLAT = 0.5
 """Cameras lie near a plane if they scatter along its normal by less than this share of their scatter within it."""
-RING_ROUND = 0.5
-"""The least scatter within the plane over the largest: less is a line of cameras, which has no plane."""
-RING_TELLING = 0.5
-"""SH of at least this share of the Gaussians must tell where cameras stood."""
+RING_ROUND = 0.5  # The least scatter within the plane over the largest: less is a line of cameras, which has no plane
+RING_TELLING = 0.5  # SH of at least this share of the Gaussians must tell where cameras stood
 FRONTAL = 0.7
 """If views look along a normal by more than this (a mean of cosines), they face a wall, and the normal is not up."""
-ONE_WAY = 0.6
-"""If the mean direction of views within the plane is longer than this, cameras did not go around."""
-LEVEL = 0.1
-"""Views do not tell the sign of up if their mean direction is within this of level."""
-FLAT = 0.4
-"""A splat has a normal if its smallest deviation is less than this share of the middle one."""
-ALIKE = math.radians(12.0)
-"""Normals within this angle are alike."""
+ONE_WAY = 0.6  # If the mean direction of views within the plane is longer than this, cameras did not go around
+LEVEL = 0.1  # Views do not tell the sign of up if their mean direction is within this of level
+FLAT = 0.4  # A splat has a normal if its smallest deviation is less than this share of the middle one
+ALIKE = math.radians(12.0)  # Normals within this angle are alike
 APART = math.radians(30.0)
 """Other surfaces are told from the largest by more than this angle between the normals, or by another height."""
-CANDIDATES = 300
-"""Directions that are tried for the normal."""
-LARGEST_AREA = 20.0
-"""A splat counts with at most so many times the median area: a few huge ones are no ground."""
-SLAB = 0.03
-"""Thickness of a ground over the scene's extent."""
-GROUND = 0.1
-"""Least share of all flat splats that lie in a ground."""
-GROUND_ROWS = 60
-"""Least number of sampled splats in a ground."""
-DOMINANT = 2.0
-"""A ground is so many times larger than any other surface: the faces of a box or a room are alike."""
-ABOVE = 0.85
-"""Of what is not in the ground, this share lies above it."""
-BESIDE = 0.05
-"""Least share of the scene's opacity outside the ground."""
+CANDIDATES = 300  # Directions that are tried for the normal
+LARGEST_AREA = 20.0  # A splat counts with at most so many times the median area: a few huge ones are no ground
+SLAB = 0.03  # Thickness of a ground over the scene's extent
+GROUND = 0.1  # Least share of all flat splats that lie in a ground
+GROUND_ROWS = 60  # Least number of sampled splats in a ground
+DOMINANT = 2.0  # A ground is so many times larger than any other surface: the faces of a box or a room are alike
+ABOVE = 0.85  # Of what is not in the ground, this share lies above it
+BESIDE = 0.05  # Least share of the scene's opacity outside the ground
 ALONG = {"camera ring": math.radians(12.0), "ground": math.radians(3.0)}
 """Up is an axis if it is this near to one. A ground is known better than a ring."""
-AGREEING = math.radians(25.0)
-"""Ground and ring agree if they are within this angle."""
-DIGITS = 6
-"""Normals are rounded to so many decimals, so that all machines find the same."""
+AGREEING = math.radians(25.0)  # Ground and ring agree if they are within this angle
+DIGITS = 6  # Normals are rounded to so many decimals, so that all machines find the same
 
 
 @dataclass(frozen=True)
@@ -238,5 +218,4 @@ def _scatter(away: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def _dot(line: np.ndarray, points: np.ndarray) -> np.ndarray:
     """[n] f64, `line` ([3]) times `points` ([3, n]), without BLAS, whose threads are slow on a busy machine."""
-    product: np.ndarray = line[0] * points[0] + line[1] * points[1] + line[2] * points[2]
-    return product
+    return line[0] * points[0] + line[1] * points[1] + line[2] * points[2]

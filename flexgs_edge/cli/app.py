@@ -1,7 +1,5 @@
 """The command line: the group of subcommands, and `main`, which turns errors into messages and exit codes."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os
@@ -16,10 +14,9 @@ from typing import Any, NoReturn
 import click
 
 from flexgs_edge._version import __version__
-from flexgs_edge.cli.lazy_group import LazyGroup
+from flexgs_edge.cli.help_page import LazyGroup
 from flexgs_edge.cli.talk import State, printable
-from flexgs_edge.errors import InputError
-from flexgs_edge.run.failure import failure_of
+from flexgs_edge.errors import InputError, failure_of
 
 COMMANDS = {
     "compress": "Make a scene smaller: to a quality or to a size.",
@@ -39,7 +36,8 @@ REPEAT_SECONDS = 1.0  # `timeout` sends its signal twice: to the program, and to
 
 @click.group(
     cls=LazyGroup,
-    commands_from=("flexgs_edge.cli", COMMANDS),
+    modules=("flexgs_edge.cli.commands", "flexgs_edge.cli.compress", "flexgs_edge.cli.study"),
+    lines=COMMANDS,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, "-V", "--version", message="flexgs-edge %(version)s")

@@ -8,36 +8,20 @@ import click
 from click.core import ParameterSource
 
 from flexgs_edge.cli import shared_options, talk, value_types
-from flexgs_edge.cli.help_page import EFFORT, MACHINES, METHOD, OUTPUT, VIEWS, ExpertCommand, option
+from flexgs_edge.cli.help_page import EFFORT, INPUT, MACHINES, METHOD, OUTPUT, VIEWS, ExpertCommand, option
 
 if TYPE_CHECKING:
     from flexgs_edge.progress import Progress
-    from flexgs_edge.report.batch_result import BatchResult
+    from flexgs_edge.report.results import BatchResult
     from flexgs_edge.run.options import CompressOptions
 
 REACH = "What to reach (give one target; default: --max-drop 1.0)"
 USUAL = (
-    "max_drop",
-    "min_fidelity",
-    "max_worst_drop",
-    "max_size",
-    "min_ratio",
-    "best_effort",
-    "cameras",
-    "images",
-    "antialiased",
-    "effort",
-    "memory_limit",
-    "device",
-    "output",
-    "layers",
-    "preview",
-    "report",
-    "json_path",
-    "dry_run",
-    "force",
-    "quiet",
-)  # Options that `--help` shows, in order. `--expert` shows the others too.
+    "max_drop", "min_fidelity", "max_worst_drop", "max_size", "min_ratio", "best_effort", "cameras", "images",
+    "antialiased", "effort", "memory_limit", "device", "output", "layers", "preview", "report", "json_path", "dry_run",
+    "force", "quiet",
+)  # fmt: skip
+"""Options that `--help` shows, in order. `--expert` shows the others too."""
 MORE = """\b
 More examples:
   flexgs-edge compress point_cloud.ply -o a.fgs --method paper --score-cache s.npz
@@ -117,6 +101,18 @@ Several scenes:
     help="Go on where the photos do not show what the scene shows from their cameras. Default: stop, and name the likely cause.",
 )
 @shared_options.drop_invalid_option
+@option(
+    INPUT,
+    "--clean",
+    metavar="[gentle|thorough]",
+    is_flag=False,
+    flag_value="gentle",
+    help="Leave out floaters, needles and invalid values, and isolated matter that no view shows (gentle; the word may be left "
+    "out) or hardly shows (thorough).",
+)
+@option(
+    OUTPUT, "--keep-removed", metavar="FILE", help="Write what --clean removed, with the values that came in: a .ply."
+)
 @option(
     EFFORT,
     "--effort",
@@ -233,7 +229,7 @@ Several scenes:
     help="Ranges of each channel. More: better, larger files. Default: one for about 512 Gaussians.",
 )
 @shared_options.run_options
-def command(
+def compress(
     inputs: tuple[str, ...], output: str | None, format: str | None, json_path: str | None, quiet: bool, **options: Any
 ) -> None:
     """Make a scene smaller: to a quality or to a size.
@@ -252,7 +248,7 @@ def command(
     """
     progress = talk.start(quiet, json_path, options["force"], options["report"])
     from flexgs_edge.commands.compress import compress
-    from flexgs_edge.run.batch import is_batch, single_output
+    from flexgs_edge.commands.compress_all import is_batch, single_output
     from flexgs_edge.run.options import METHOD_ONLY, CompressOptions, check_method
 
     # An option that the user typed counts as given, even if it equals the default.

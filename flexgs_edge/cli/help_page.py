@@ -1,8 +1,10 @@
-"""Help pages: options under headings. Rarely used options appear only with `--expert`."""
+"""Help pages: options under headings. Rarely used options appear only with `--expert`.
 
-from __future__ import annotations
+Groups of subcommands import a subcommand only to run it.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, TypeVar
 
 import click
@@ -24,6 +26,34 @@ _LAST = (INPUT, VIEWS, EFFORT, DEVICE, MACHINES, OUTPUT, METHOD, f"{METHOD} best
 _NAMES_WIDTH = 22
 """Width of the column of option names. A longer name gets its own line, so that texts keep their width."""
 _EXPERT = "flexgs_edge.expert"  # Key in `meta` of a context that says whether `--expert` was given
+
+
+class LazyGroup(click.Group):
+    """A group that knows the names of its subcommands, and imports their modules only to run one.
+
+    `modules`: define the subcommands by their names. `lines`: the overview's line for each name.
+    """
+
+    def __init__(self, *args: Any, modules: Sequence[str], lines: Mapping[str, str], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.modules, self.lines = modules, lines
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.lines)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.lines:
+            return None
+        found = (getattr(import_module(module), cmd_name, None) for module in self.modules)
+        return next(command for command in found if isinstance(command, click.Command))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        self.format_commands(ctx, formatter)
+        click.Command.format_options(self, ctx, formatter)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(self.lines.items()))
 
 
 class SectionOption(click.Option):

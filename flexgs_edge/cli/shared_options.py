@@ -1,7 +1,5 @@
 """Options that several subcommands share."""
 
-from __future__ import annotations
-
 import click
 
 from flexgs_edge.cli.help_page import DEVICE, FAULTS, INPUT, OUTPUT, VIEWS, option, stack

@@ -1,13 +1,13 @@
 """`flexgs-edge study`: charts of a user's own scenes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click
 
-from flexgs_edge.cli import help_page, shared_options, talk
-from flexgs_edge.cli.lazy_group import LazyGroup
+from flexgs_edge.cli import help_page, shared_options, talk, value_types
+from flexgs_edge.cli.help_page import LazyGroup
+from flexgs_edge.progress import Progress
+from flexgs_edge.report.run_info import Result
 
 COMMANDS = {
     "rate": "Chart bytes against quality for a scene.",
@@ -16,8 +16,8 @@ COMMANDS = {
 }  # Subcommands and the first sentence of their help
 
 
-@click.group(cls=LazyGroup, commands_from=("flexgs_edge.cli.study", COMMANDS))
-def command() -> None:
+@click.group(cls=LazyGroup, modules=("flexgs_edge.cli.study",), lines=COMMANDS)
+def study() -> None:
     """Run experiments on your own scenes: tables and charts.
 
     A study writes a folder: index.html with all charts, the rows of every experiment as CSV and JSON, and its chart as PNG and
@@ -32,30 +32,15 @@ def command() -> None:
     """
 
 
-class RatiosType(click.ParamType):
-    """Ratios: `8,16,32`, or none."""
-
-    name = "LIST"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        if isinstance(value, tuple):
-            return value
-        if value.strip().lower() == "none":
-            return ()
-        try:
-            return tuple(float(part) for part in value.split(","))
-        except ValueError:
-            self.fail(f"{value!r}: expected ratios such as 8,16,32, or none", param, ctx)
-
-
-RATIOS = RatiosType()
-
-
 @click.command("rate", cls=help_page.SectionCommand)
 @click.argument("scene", metavar="SCENE", type=click.Path())
 @shared_options.results_option
 @help_page.option(
-    "Points", "--ratios", type=RATIOS, default="8,16,32,64,128,256", help="Ratios to the .ply that both methods aim at."
+    "Points",
+    "--ratios",
+    type=value_types.RATIOS,
+    default="8,16,32,64,128,256",
+    help="Ratios to the .ply that both methods aim at.",
 )
 @help_page.option(
     "Points",
@@ -65,9 +50,8 @@ RATIOS = RatiosType()
     help="Effort of the search at these ratios, as for compress.",
 )
 @shared_options.study_options
-def rate(
-    scene: str, output: str, ratios: tuple[float, ...], json_path: str | None, quiet: bool, **options: Any
-) -> None:
+@talk.told
+def rate(scene: str, output: str, ratios: tuple[float, ...], force: bool, progress: Progress, **options: Any) -> Result:
     """Chart bytes against quality for a scene.
 
     \b
@@ -83,12 +67,10 @@ def rate(
       flexgs-edge study rate point_cloud.ply -o rate --ratios 10,20,40
       flexgs-edge study rate scene.ply -o rate --effort fast
     """
-    progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
     from flexgs_edge.studies.rate import study_rate
 
-    result = study_rate(scene, output, CompressOptions(**options), progress, ratios=ratios)
-    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    return study_rate(scene, output, CompressOptions(force=force, **options), progress, ratios=ratios)
 
 
 @click.command("speed", cls=help_page.SectionCommand)
@@ -96,7 +78,8 @@ def rate(
 @shared_options.results_option
 @shared_options.study_target_option
 @shared_options.study_options
-def speed(scene: str, output: str, json_path: str | None, quiet: bool, **options: Any) -> None:
+@talk.told
+def speed(scene: str, output: str, force: bool, progress: Progress, **options: Any) -> Result:
     """Chart the time of a run against the ratio that it finds.
 
     Compresses the scene by each method and effort. Results appear in DIR when all is done: open DIR/index.html. Times are
@@ -107,12 +90,10 @@ def speed(scene: str, output: str, json_path: str | None, quiet: bool, **options
       flexgs-edge study speed point_cloud.ply -o speed
       flexgs-edge study speed scene.ply -o speed --max-drop 0.5 --resolution 800
     """
-    progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
     from flexgs_edge.studies.speed import study_speed
 
-    result = study_speed(scene, output, CompressOptions(**options), progress)
-    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    return study_speed(scene, output, CompressOptions(force=force, **options), progress)
 
 
 @click.command("stability", cls=help_page.SectionCommand)
@@ -121,7 +102,8 @@ def speed(scene: str, output: str, json_path: str | None, quiet: bool, **options
 @help_page.option("Points", "--quick", is_flag=True, help="Fewer points and small views: much faster, less exact.")
 @shared_options.study_target_option
 @shared_options.study_options
-def stability(scene: str, output: str, quick: bool, json_path: str | None, quiet: bool, **options: Any) -> None:
+@talk.told
+def stability(scene: str, output: str, quick: bool, force: bool, progress: Progress, **options: Any) -> Result:
     """Find where methods break on a scene.
 
     \b
@@ -137,9 +119,7 @@ def stability(scene: str, output: str, quick: bool, json_path: str | None, quiet
       flexgs-edge study stability point_cloud.ply -o stability --quick
       flexgs-edge study stability scene.ply -o stability --max-drop 0.5
     """
-    progress = talk.start(quiet, json_path, options["force"])
     from flexgs_edge.run.options import CompressOptions
     from flexgs_edge.studies.stability import study_stability
 
-    result = study_stability(scene, output, CompressOptions(**options), progress, quick=quick)
-    talk.emit(result.to_text(), result.to_json(), json_path, options["force"])
+    return study_stability(scene, output, CompressOptions(force=force, **options), progress, quick=quick)

@@ -1,11 +1,12 @@
 """Output of a command: the summary to stdout, everything else to stderr."""
 
-from __future__ import annotations
-
 import logging
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import click
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.progress import Progress
+from flexgs_edge.report.run_info import Result
 
 CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Characters that move the cursor, set colours or titles, or turn the direction of text: a file's strings may hold them."""
@@ -33,6 +35,23 @@ class PrintableFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The line of a record."""
         return printable(super().format(record))
+
+
+def told(command: Callable[..., Result]) -> Callable[..., None]:
+    """Open the log before a command, and print its result and write its JSON after it.
+
+    The command gets the progress bars, and of the options of every command, those that it names.
+    """
+
+    @wraps(command)
+    def run(json_path: str | None, quiet: bool, force: bool, **words: Any) -> None:
+        progress = start(quiet, json_path, force, words.get("report"))
+        offered = {"progress": progress, "quiet": quiet, "force": force}
+        taken = {name: value for name, value in offered.items() if name in signature(command).parameters}
+        result = command(**words, **taken)
+        emit(result.summary(), result.to_json(), json_path, force)
+
+    return run
 
 
 @dataclass

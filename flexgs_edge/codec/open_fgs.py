@@ -1,14 +1,11 @@
 """Open, read or verify a `.fgs` file, whatever its version."""
 
-from __future__ import annotations
-
 import os
 import struct
 
-from flexgs_edge.codec.header import Section
-from flexgs_edge.codec.sections import MAGIC
+from flexgs_edge.codec.sections import MAGIC, Section
 from flexgs_edge.codec.v1 import container as v1
-from flexgs_edge.codec.v1.header import Header
+from flexgs_edge.codec.v1.container import Header
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.codec.v2 import container as v2
 from flexgs_edge.codec.v2.grid_source import GridSource

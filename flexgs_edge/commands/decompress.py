@@ -1,6 +1,4 @@
-"""`decompress`: write a scene as a PLY that every viewer opens, or in another program's format."""
-
-from __future__ import annotations
+"""`decompress`: write a scene as a PLY that every viewer opens, or in another program's format, and tell what that loses."""
 
 import json
 import os
@@ -14,11 +12,14 @@ from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.v2.container import GridContainer, Preview
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.header import GridHeader
-from flexgs_edge.errors import InputError
+from flexgs_edge.constants import SH_C0
+from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.files import check_folder, check_writable
+from flexgs_edge.io.codes import opacities
 from flexgs_edge.io.exchange import (
     MovedSource,
     check_positions,
+    near_order,
     offset_place,
     wants_double,
     write_foreign,
@@ -29,26 +30,26 @@ from flexgs_edge.io.formats import FORMATS, WRITTEN, Format, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED
+from flexgs_edge.kernels.tested import BUILD_BYTES, RUNTIME_BYTES
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import LOG
-from flexgs_edge.report.file_results import DecompressResult
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.conversion import conversion_loss
+from flexgs_edge.progress import LOG, Stopwatch
+from flexgs_edge.report.file_results import ConversionLoss, DecompressResult
 from flexgs_edge.run.decoding import ahead, decode_bytes, decoded_once, decoder
 from flexgs_edge.run.inputs import CheckedScene, ScenePlace, load_scene, scene_info
+from flexgs_edge.run.open_renderer import open_renderer, run_info
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, ViewOptions
-from flexgs_edge.run.spent import run_info
+from flexgs_edge.run.quality_evaluator import QualityEvaluator
+from flexgs_edge.run.run import open_run
 from flexgs_edge.scene.source import SceneSource
 
-WRITE_COPIES = 3
-"""Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY."""
+WRITE_COPIES = 3  # Copies of a chunk's rows in memory while decoding and writing: codes, planes, rows of the PLY
 LEAST_ROWS = 1024  # Rows of a PLY that are written at a time, at least
 SPARE_SHARE = 8
 """Of what decoding takes, one part in so many is left free beside rows of a PLY: docs/results/tuning.md#heap"""
-WARN_DROP = 0.5
-"""We warn of a conversion whose pictures lose more than this, dB."""
+WARN_DROP = 0.5  # We warn of a conversion whose pictures lose more than this, dB
 ANTIALIASED_NOTE = "an antialiased model: the file does not say so; viewers must be told, and here --antialiased"
+_ROWS = 1 << 16  # Rows whose values are compared
 
 
 def decompress(
@@ -66,39 +67,13 @@ def decompress(
 
     The PLY is little endian with zero normals, and is written chunk by chunk. Its positions have the type that came in.
 
-    Parameters
-    ----------
-    input : path or CheckedScene
-        Any scene: a `.fgs`, a `.ply`, a file of another program's format, or a model folder.
-    output : path
-        The `.ply`, `.spz`, `.sog` or `.compressed.ply` to write, or `FOLDER/lod-meta.json` for streamed SOG.
-    force : bool
-        Overwrite `output` if it exists. Default: raise `InputError`.
-    memory_limit : int, optional
-        Bytes for the whole process. Default: three quarters of the free memory.
-    reading : Reading, optional
-        Frame, level of detail and SH degree.
-    writing : Writing, optional
-        How the file is written.
-    recenter : bool
-        Move a scene that lies far from zero to zero, and write the offset beside `output` (other programs' formats).
-    cameras : str, optional
-        Cameras of the pictures that tell what another program's format loses; `none`: no pictures. Default: those beside the
-        scene, else generated ones.
-    device : str, optional
-        Device that decodes and draws: a processor as `devices` lists it, or `numpy`. Default: see `decoder`.
-
-    Returns
-    -------
-    DecompressResult
-        Paths, sizes, times and memory.
-
-    Raises
-    ------
-    InputError
-        If a path or a format is not usable.
-    FormatError
-        If the input does not follow its format.
+    `input`: a `.fgs`, a `.ply`, a file of another program's format, a model folder, or a scene that is open. `output`: the
+    `.ply`, `.spz`, `.sog` or `.compressed.ply` to write, or `FOLDER/lod-meta.json` for streamed SOG. `memory_limit`: bytes
+    for the whole process. Default: three quarters of the free memory. `device`: decodes and draws: a processor as `devices`
+    lists it, or `numpy`. Default: see `decoder`. `recenter`: move a scene that lies far from zero to zero, and write the
+    offset beside `output` (other programs' formats). `cameras`: of the pictures that tell what another program's format
+    loses; `none`: no pictures. Default: those beside the scene, else generated ones. Returns paths, sizes, times and memory.
+    Raises `InputError` if a path or a format is not usable. Raises `FormatError` if the input does not follow its format.
     """
     streamed = Path(output).name == STREAMED
     format = FORMATS[".sog"] if streamed else written_format(output, writing)
@@ -208,3 +183,72 @@ def _written_bytes(output: Path) -> int:
     names: list[str] = json.loads(output.read_bytes())["filenames"]
     folders = [output.parent / name for name in names]
     return output.stat().st_size + sum(file.stat().st_size for place in folders for file in place.parent.iterdir())
+
+
+def conversion_loss(
+    scene: CheckedScene,
+    output: str | os.PathLike[str],
+    options: ViewOptions,
+    format: Format | None,
+    recentred: bool = False,
+) -> ConversionLoss:
+    """Compare a written file with its scene, by the views and the photos that `evaluate` takes.
+
+    `scene`: what was written to `output`. `options`: cameras, device and memory limit of the pictures. `format`: what the
+    file's rows are ordered for, so that values can be compared; `None`: they have another order. `recentred`: the file's
+    scene was moved to zero. Returns the loss without pictures where the options name no cameras, or device or memory do
+    not allow any: `why` says so.
+    """
+    written = load_scene(output)
+    if recentred:
+        written = replace(written, source=MovedSource(written.source, scene.source.origin))
+    values = {} if format is None else _value_errors(scene.source, written.source, format.chunked)
+    if options.cameras == NO_CAMERAS:
+        return ConversionLoss(values, why=f"--cameras {NO_CAMERAS}")
+    if options.device == "numpy" and options.cameras is None:
+        return ConversionLoss(values, why="NumPy draws slowly: --cameras PATH compares them all the same")
+    try:
+        run = open_run(scene, options)
+        if options.device != "numpy":
+            run.budget.require("the OpenCL runtime", RUNTIME_BYTES + BUILD_BYTES)
+        chosen = run.seen.held_out or run.seen.train
+        with open_renderer(run) as renderer:
+            judge = QualityEvaluator(renderer, run.source, run.seen, chosen)
+            with renderer.load(run.source) as original:
+                judge.prepare(original)
+            with renderer.load(written.source) as drawn:
+                quality = judge.compare(drawn)
+            judge.close()
+    except (BudgetError, DeviceError, InputError) as error:
+        return ConversionLoss(values, why=str(error))
+    covered = quality.covered_decides
+    found = [view.covered_fidelity if covered else view.fidelity for view in quality.views]
+    return ConversionLoss(
+        values,
+        views=len(chosen),
+        cameras=run.seen.cameras_from,
+        fidelity=quality.deciding_fidelity,
+        worst=min((value for value in found if value is not None), default=None),
+        drop=quality.usual_drop,
+        base_psnr=None if run.seen.photos is not None else quality.base_psnr,
+    )
+
+
+def _value_errors(source: SceneSource, written: SceneSource, chunked: bool) -> dict[str, tuple[float, float]]:
+    """Median and largest errors of some rows by value; the size of a splat is its largest deviation."""
+    order = near_order(source, chunked)
+    rows = np.arange(0, source.count, -(-source.count // _ROWS))
+    fields = ["means", "log_scales", "opacity_logits", "sh_dc"]
+    before, after = source.select(order[rows]).read(slice(0, rows.size), fields), written.read(rows, fields)
+    shift = (written.origin - source.origin)[:, None]
+    with np.errstate(over="ignore"):
+        sizes = np.exp(before["log_scales"].astype(np.float64).max(axis=0))
+    opaque = [opacities(planes["opacity_logits"]) for planes in (before, after)]
+    errors = {
+        "position": np.abs(after["means"] + shift - before["means"]).max(axis=0),
+        "position_by_size": np.abs(after["means"] + shift - before["means"]).max(axis=0) / sizes,
+        "log_scale": np.abs(after["log_scales"] - before["log_scales"]).max(axis=0),
+        "opacity": np.abs(opaque[1] - opaque[0])[0],
+        "colour": np.abs(after["sh_dc"] - before["sh_dc"]).max(axis=0) * SH_C0,
+    }
+    return {name: (float(np.median(error)), float(error.max())) for name, error in errors.items()}

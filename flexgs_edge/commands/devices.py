@@ -1,7 +1,5 @@
 """`devices`: list the OpenCL devices, test them, and choose one."""
 
-from __future__ import annotations
-
 from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels.choose_device import choose_device
 from flexgs_edge.kernels.tested import list_with_verdicts

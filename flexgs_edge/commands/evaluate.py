@@ -1,7 +1,5 @@
 """`evaluate`: compare a scene with its original, view by view."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +11,8 @@ from flexgs_edge.quality.lpips import Lpips
 from flexgs_edge.report.results import EvaluateResult
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.decoding import decode_bytes, read_often
-from flexgs_edge.run.foresight import drawing_bytes
 from flexgs_edge.run.inputs import scene_info
-from flexgs_edge.run.open_renderer import drawn_info, open_renderer
+from flexgs_edge.run.open_renderer import drawing_bytes, drawn_info, open_renderer
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.reporter import Reporter

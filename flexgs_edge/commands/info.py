@@ -1,7 +1,5 @@
 """`info`: show what a scene file holds."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,12 +1,10 @@
 """`trim`: make a smaller file from a layered one, by copying whole layers."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
 from flexgs_edge.codec.open_fgs import file_version, read_header
-from flexgs_edge.codec.v1.header import Header
+from flexgs_edge.codec.v1.container import Header
 from flexgs_edge.codec.v2.container import trim_container
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import InputError

@@ -1,7 +1,5 @@
 """`verify`: check every byte of a `.fgs` file against its checksums."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`view`: look at a scene in the browser, from a local server or from one file."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import shutil
@@ -18,14 +16,13 @@ import numpy as np
 
 from flexgs_edge.cameras.start import START, StartView
 from flexgs_edge.codec.open_fgs import file_version, read_header
-from flexgs_edge.codec.v1.container import write_container
-from flexgs_edge.codec.v1.header import Header
+from flexgs_edge.codec.v1.container import Header, write_container
 from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.files import atomic_folder, atomic_write, check_folder, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.packed.quantize import far_contraction, quantize_scene
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
@@ -37,8 +34,9 @@ from flexgs_edge.run.reporter import encode
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.units import format_size
-from flexgs_edge.viewer.assets import PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
-from flexgs_edge.viewer.scene_page import page_config, site_files, viewer_page
+from flexgs_edge.viewer.assets import CROP, PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
+from flexgs_edge.viewer.notes import read_notes
+from flexgs_edge.viewer.scene_page import COMMAND, page_config, site_files, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
 FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
@@ -58,6 +56,7 @@ def view(
     host: str = "127.0.0.1",
     port: int = 0,
     browser: bool = True,  # open the page in the browser
+    notes: str | os.PathLike[str] | None = None,  # a JSON file: texts at places of the scene
     ready: Callable[[SceneServer], None] | None = None,  # called with the server before it serves
     **words: Any,  # single options, by the names of `ViewOptions`
 ) -> ViewResult:
@@ -78,6 +77,7 @@ def view(
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: expected 0 to 65535")
     options = replace(options or ViewOptions(), **words)
+    texts = [] if notes is None else read_notes(notes)
     try:
         run = open_run(input, options, progress, photos=False, decodes=False)
     except (
@@ -94,10 +94,11 @@ def view(
     name = Path(os.fspath(input)).resolve().name
     with _coded(run, input) as scene:
         kind = _kind(read_header(scene))
-        files = web_files(file_version(scene), kind)
+        files = web_files(file_version(scene), kind, bool(texts))
         size = os.stat(scene).st_size
         if one_file and output is not None:
-            page = viewer_page(files, page_config(name, cameras, look), scene.read_bytes(), kind).text.encode()
+            config = page_config(name, cameras, look, notes=texts)
+            page = viewer_page(files, config, scene.read_bytes(), kind).text.encode()
             with atomic_write(output, force) as file:
                 file.write(page)
             if len(page) > PAGE_MOST:
@@ -105,7 +106,7 @@ def view(
                     "warning: browsers may not open a page of %s: compress the scene first", format_size(len(page))
                 )
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), len(page))
-        config = page_config(name, cameras, look, _SCENE_NAME)
+        config = page_config(name, cameras, look, _SCENE_NAME, texts)
         if output is not None:
             poster = _poster(run, StartView.stored(read_header(scene).settings))
             site = site_files(file_version(scene), config, kind, poster)
@@ -115,9 +116,11 @@ def view(
                 shutil.copyfile(scene, folder / _SCENE_NAME)
             total = size + sum(len(content) for content in site.values())
             return ViewResult(scene_info(run.scene), size, len(cameras), os.fspath(output), total)
-        made = viewer_page(files, config, kind=kind)
+        made = viewer_page(files, {**config, COMMAND: _compress(input, options)}, kind=kind)
         text = made.text.encode()
         resources = {PAGE: Resource("text/html; charset=utf-8", text, gzip.compress(text), made.policy)}
+        for place in CROP:
+            resources[place] = Resource("text/javascript; charset=utf-8", files[place].encode())
         resources[_SCENE] = Resource("application/octet-stream", scene)
         server = SceneServer(resources, host, port)
         address = server.address(PAGE)
@@ -135,6 +138,13 @@ def view(
         except KeyboardInterrupt:
             LOG.info("stopped")
         return ViewResult(scene_info(run.scene), size, len(cameras), address, None)
+
+
+def _compress(input: str | os.PathLike[str], options: ViewOptions) -> list[str]:
+    """The command line that reads the same scene, to which the page adds what to keep of it."""
+    asked = {"--frame": options.frame, "--lod": options.lod, "--sh-degree": options.sh_degree}
+    words = [word for name, value in asked.items() if value is not None for word in (name, str(value))]
+    return ["flexgs-edge", "compress", os.fspath(input), *words]
 
 
 def _poster(run: Run[ViewOptions], start: StartView | None) -> bytes | None:

@@ -5,8 +5,6 @@ SSIM that is lost, and on generated poses, where no given camera stood. Bounds f
 Each is used to a *share*: what was measured over what is allowed. A result holds if no share is above 1.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

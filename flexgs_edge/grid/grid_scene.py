@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
+
+CODES = ("position", "scale", "rotation", "opacity", "dc")  # Arrays with a column for each row of a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +42,19 @@ class GridScene:
         degrees = self.sh_degrees[rows]
         top = int(degrees.max(initial=0))
         bands = tuple(storage.take(self.sh[d], row_places(self.sh_degrees, rows, d + 1)) for d in range(top))
-        return GridScene(
-            len(rows),
-            top,
-            self.origin,
-            replace(self.step_sizes, sh=self.step_sizes.sh[:top]),
-            storage.take(self.position, rows),
-            storage.take(self.scale, rows),
-            storage.take(self.rotation, rows),
-            storage.take(self.opacity, rows),
-            storage.take(self.dc, rows),
-            degrees,
-            bands,
-            self.layer[rows],
-        )
+        steps = replace(self.step_sizes, sh=self.step_sizes.sh[:top])
+        codes: dict[str, Any] = {name: storage.take(getattr(self, name), rows) for name in CODES}
+        changed: dict[str, Any] = {
+            "count": len(rows),
+            "sh_degree": top,
+            "step_sizes": steps,
+            "sh_degrees": degrees,
+            "sh": bands,
+        }
+        return replace(self, layer=self.layer[rows], **changed, **codes)
 
 
 def row_places(degrees: np.ndarray, rows: np.ndarray, degree: int) -> np.ndarray:
     """Columns of some rows in the SH arrays of a degree; rows below that degree have none."""
     places = np.cumsum(degrees >= degree) - 1
-    chosen: np.ndarray = places[rows[degrees[rows] >= degree]]
-    return chosen
+    return places[rows[degrees[rows] >= degree]]

@@ -1,7 +1,5 @@
 """Quantize a scene to grid codes: sort it along the Morton curve, and round each value to its step size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -184,10 +182,7 @@ def _band_codes(
     storage: Storage,
     order: np.ndarray | None = None,
 ) -> np.ndarray:
-    """[3 * (2l + 1), n] codes of the coefficients of one SH degree l.
-
-    `order` gives the input rows for error messages.
-    """
+    """[3 * (2l + 1), n] codes of the coefficients of one SH degree l. `order` gives the input rows for error messages."""
     codes = storage.empty((3, 2 * degree + 1, len(rows)), np.int32)
     for part in blocks(len(rows)):
         chosen = rows[part]

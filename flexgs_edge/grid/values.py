@@ -1,7 +1,5 @@
 """Dequantize grid codes to float32 values, in the operations that every decoder must use."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -108,8 +106,7 @@ def _spread_bands(grid: GridScene, degrees: np.ndarray, bands: Sequence[np.ndarr
 
 
 def _values(codes: np.ndarray, step: float) -> np.ndarray:
-    values: np.ndarray = codes.astype(np.float32) * np.float32(step)
-    return values
+    return codes.astype(np.float32) * np.float32(step)
 
 
 def _means(codes: np.ndarray, steps: StepSizes) -> np.ndarray:

@@ -1,10 +1,10 @@
 """Codes that several formats share: nearest integers, opacities, and quaternions without their largest component."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
+
+from flexgs_edge.small_matrices import quaternion_product
 
 SMALLER = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """The components of a quaternion that are stored, by the largest one."""
@@ -27,8 +27,7 @@ def nearest(values: np.ndarray, most: int = 255) -> np.ndarray:
     >>> nearest(np.array([-3.0, 0.6, 300.0])).tolist()
     [0, 1, 255]
     """
-    codes: np.ndarray = np.clip(np.rint(values), 0, most).astype(np.uint8 if most < 256 else np.uint32)
-    return codes
+    return np.clip(np.rint(values), 0, most).astype(np.uint8 if most < 256 else np.uint32)
 
 
 def opacities(logits: np.ndarray) -> np.ndarray:
@@ -60,15 +59,13 @@ def with_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def rest_of_unit(parts: np.ndarray) -> np.ndarray:
     """[1, n], the component that makes quaternions of norm 1 of `parts` [3, n]."""
-    rest: np.ndarray = np.sqrt(np.maximum(1 - (parts * parts).sum(axis=0, keepdims=True), 0))
-    return rest
+    return np.sqrt(np.maximum(1 - (parts * parts).sum(axis=0, keepdims=True), 0))
 
 
 def _places(largest: np.ndarray) -> np.ndarray:
     """[3, n], the places of the others: behind the largest, they move on by one."""
     places = np.arange(3)[:, None]
-    moved: np.ndarray = places + (places >= largest)
-    return moved
+    return places + (places >= largest)
 
 
 def unpack_small(codes: np.ndarray, mode: np.ndarray) -> np.ndarray:
@@ -119,13 +116,4 @@ def _turn_weights(scales: np.ndarray) -> np.ndarray:
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """[n, 4], products of quaternions w x y z."""
-    (w, x, y, z), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            (w * bw - x * bx) - (y * by + z * bz),
-            (w * bx + x * bw) + (y * bz - z * by),
-            (w * by - x * bz) + (y * bw + z * bx),
-            (w * bz + x * by) - (y * bx - z * bw),
-        ],
-        axis=-1,
-    )
+    return quaternion_product(a.T, b.T).T

@@ -4,8 +4,6 @@ Element `chunk` has the ranges of positions, log-scales and colours; element `ve
 byte for each SH coefficient, in INRIA's order.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,14 +19,12 @@ from flexgs_edge.io.ply_layout import PROGRAM, Element, PlyHeader, left_out, rea
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.scene.source import REST_WIDTHS, Planes, Rows, SceneSource
 
-CHUNK = 256
-"""Gaussians of a chunk; the last one may have fewer."""
+CHUNK = 256  # Gaussians of a chunk; the last one may have fewer
 _RANGES = {
     "means": (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
     "log_scales": (("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")),
     "sh_dc": (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
-}
-"""Properties of a chunk by field; files without those of colours have colours of 0 to 1."""
+}  # Properties of a chunk by field; files without those of colours have colours of 0 to 1
 _WORDS = {
     "means": "packed_position",
     "quats": "packed_rotation",
@@ -37,11 +33,9 @@ _WORDS = {
     "opacity_logits": "packed_color",
 }
 _VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_BITS = ((21, 11), (11, 10), (0, 11))
-"""Shift and width of x, y and z in a word of positions or scales."""
+_BITS = ((21, 11), (11, 10), (0, 11))  # Shift and width of x, y and z in a word of positions or scales
 _QUAT_MAX = (1 << 10) - 1
-_SH_REACH = 4.0
-"""SH codes reach so far on both sides."""
+_SH_REACH = 4.0  # SH codes reach so far on both sides
 _SCALE_LIMIT = 20.0
 """Log-scales are clamped to this, as others do: one outlier would take the digits of its whole chunk."""
 _CHUNK_ROWS = 64 * CHUNK
@@ -63,7 +57,6 @@ class CompressedPlySource(DecodedSource):
         self._ranges, self._words, self._sh = ranges, words, sh
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
-        """See `DecodedSource.decode`."""
         if field == "sh_rest":
             return _sh_values(self._sh[rows].T)
         words = self._words[_WORDS[field]][rows]
@@ -95,10 +88,7 @@ def _quats(words: np.ndarray) -> np.ndarray:
 
 
 def read_compressed_ply(path: Path, name: str, reading: Reading) -> CompressedPlySource:
-    """Open a compressed PLY; see `Format.reader`.
-
-    Raises `FormatError` if it breaks the format, or is another kind of PLY.
-    """
+    """Open a compressed PLY; see `Format.reader`. Raises `FormatError` if it breaks the format, or is another kind of PLY."""
     with open(path, "rb") as file:
         head = file.read(8)
         file.seek(0)
@@ -187,8 +177,7 @@ def _need(name: str, element: Element, names: tuple[str, ...], kind: str) -> Non
 
 def _rows(file: BinaryIO, header: PlyHeader, element: Element) -> np.ndarray:
     dtype = np.dtype([(p.name, header.order + p.type) for p in element.properties])
-    rows: np.ndarray = np.fromfile(file, dtype, element.count)
-    return rows
+    return np.fromfile(file, dtype, element.count)
 
 
 def _columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
@@ -249,8 +238,7 @@ def chunk_order(means: np.ndarray) -> np.ndarray:
         first = side[sorted_rows]
         waiting += [sorted_rows[~first].reshape(3, -1), sorted_rows[first].reshape(3, -1)]
     # Only the last chunk of a file may have fewer rows.
-    order: np.ndarray = np.concatenate(sorted(chunks, key=lambda rows: len(rows) != CHUNK))
-    return order
+    return np.concatenate(sorted(chunks, key=lambda rows: len(rows) != CHUNK))
 
 
 def _bounded(source: SceneSource) -> Iterator[Planes]:
@@ -297,8 +285,7 @@ def _code(shares: np.ndarray, bits: int) -> np.ndarray:
 def _quat_words(quats: np.ndarray) -> np.ndarray:
     largest, others = without_largest(quats)
     first, second, third = (_code(part / np.sqrt(2) + 0.5, 10) for part in others)
-    words: np.ndarray = largest.astype(np.uint32) << 30 | first << 20 | second << 10 | third
-    return words
+    return largest.astype(np.uint32) << 30 | first << 20 | second << 10 | third
 
 
 def _sh_codes(values: np.ndarray) -> np.ndarray:

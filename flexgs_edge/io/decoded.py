@@ -1,15 +1,13 @@
 """The frame of all readers that hold a file's packed values in memory and decode rows when they are asked for."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 
 from flexgs_edge.io.frames import Frame
-from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT
-from flexgs_edge.scene.source import Planes, Rows, SceneSource
+from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT, sh_rest_count
+from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
 _BLOCK_ROWS = 16384  # Rows decoded at a time, so that intermediate arrays stay small
 
@@ -51,6 +49,34 @@ class DecodedSource(SceneSource):
                     with np.errstate(over="ignore", invalid="ignore"):
                         plane[:, part] = self.decode(some, field)
         return planes
+
+
+class PartsSource(DecodedSource):
+    """Parts one behind the other, each with a SH degree of its own; SH above it are zero.
+
+    `counts`, `degrees`: Gaussians and SH degree of each part.
+    """
+
+    def __init__(self, name: str, counts: Sequence[int], degrees: Sequence[int], held_bytes: int) -> None:
+        super().__init__(name, sum(counts), max(degrees, default=0), held_bytes)
+        self._degrees, self._starts = degrees, np.cumsum([0, *counts[:-1]], dtype=np.int64)
+
+    @abstractmethod
+    def decode_part(self, number: int, rows: Rows, field: str) -> np.ndarray:
+        """As `decode`, of rows that are counted within a part."""
+
+    def decode(self, rows: Rows, field: str) -> np.ndarray:
+        size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
+        values = np.zeros((FIELD[field].width(self.sh_degree), size))
+        for number, some, place in by_chunk(rows, self._starts):
+            start, degree = int(self._starts[number]), self._degrees[number]
+            own: Rows = slice(some.start - start, some.stop - start) if isinstance(some, slice) else some - start
+            if field != "sh_rest":
+                values[:, place] = self.decode_part(number, own, field)
+            elif degree:
+                found = self.decode_part(number, own, field).reshape(3, sh_rest_count(degree), -1)
+                values.reshape(3, -1, size)[:, : found.shape[1], place] = found
+        return values
 
 
 def opacity_logits(opacities: np.ndarray, limit: float = OPACITY_LIMIT) -> np.ndarray:

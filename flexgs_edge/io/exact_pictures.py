@@ -1,7 +1,5 @@
 """Pictures that hold numbers: WebP and PNG as exact bytes, with their size checked before anything is decoded."""
 
-from __future__ import annotations
-
 import io
 import struct
 

@@ -1,7 +1,5 @@
 """Read and write scenes in formats of other projects, in the frame and the row order of each format."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence
@@ -19,14 +17,11 @@ from flexgs_edge.io.frames import in_frame
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
 from flexgs_edge.io.streamed_sog_writer import STREAMED, write_streamed_sog
 from flexgs_edge.scene.curve import near_rows
-from flexgs_edge.scene.lower_sh import without_degrees
 from flexgs_edge.scene.rotations import normalize_quats
-from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
+from flexgs_edge.scene.source import Planes, SceneSource, WrappedSource, without_degrees
 
-_FINER = 10.0
-"""A scene is too far from zero for a format if its positions would be so many times finer at zero."""
-_FAR = 16.0
-"""Rows further than so many median distances from the median centre are far."""
+_FINER = 10.0  # A scene is too far from zero for a format if its positions would be so many times finer at zero
+_FAR = 16.0  # Rows further than so many median distances from the median centre are far
 
 
 def read_foreign(
@@ -34,23 +29,8 @@ def read_foreign(
 ) -> SceneSource:
     """Open a scene in another program's format, with its axes in RDF.
 
-    Parameters
-    ----------
-    path : path
-        The file that is read.
-    reading : Reading, optional
-        Frame and level that the user asks for.
-    name : str, optional
-        The path for messages. Default: `path`.
-    format : Format, optional
-        Default: as the file name says.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    FormatError
-        If the file breaks its format.
+    `reading`: frame and level that the user asks for. `name`: the path for messages. Default: `path`. `format`: by default,
+    as the file name says. Raises `InputError` if the file cannot be read. Raises `FormatError` if it breaks its format.
     """
     name = os.fspath(path) if name is None else name
     format = format or format_of(path)
@@ -69,18 +49,8 @@ def write_foreign(
     """Write a scene in another program's format, with the losses of that format.
 
     Rows are written along a space-filling curve (`near_order`), because neighbours share ranges and compress together.
-
-    Returns
-    -------
-    tuple of str
-        Notes for the summary.
-
-    Raises
-    ------
-    InputError
-        If the file exists and `force` is not set, or the format cannot hold the scene.
-    BudgetError
-        If the disk is full.
+    Returns notes for the summary. Raises `InputError` if the file exists and `force` is not set, or the format cannot hold
+    the scene. Raises `BudgetError` if the disk is full.
     """
     format = written_format(path, writing)
     assert format is not None
@@ -149,8 +119,7 @@ def near_order(source: SceneSource, chunked: bool = False, chunk_rows: int = 655
     if chunked:
         groups = np.flatnonzero(octaves == 0), np.flatnonzero(octaves)
         return np.concatenate([rows[chunk_order(means[:, rows])] for rows in groups if rows.size])
-    found: np.ndarray = order[np.argsort(octaves[order], kind="stable")]
-    return found
+    return order[np.argsort(octaves[order], kind="stable")]
 
 
 def _areas(source: SceneSource, rows: np.ndarray) -> np.ndarray:
@@ -163,19 +132,11 @@ def _areas(source: SceneSource, rows: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Rounding:
-    """What a format's positions lose of a scene, known before it is written.
+    """What a format's positions lose of a scene, known before it is written."""
 
-    Parameters
-    ----------
-    moved : int
-        Gaussians that rounding moves by more than their own size, that is their largest deviation.
-    error, smallest : float
-        Largest error of a position, and the size of the smallest splat, scene units.
-    """
-
-    moved: int
-    error: float
-    smallest: float
+    moved: int  # Gaussians that rounding moves by more than their own size, that is their largest deviation
+    error: float  # largest error of a position, scene units
+    smallest: float  # size of the smallest splat, scene units
 
 
 def rounding_of(source: SceneSource, format: Format, chunk_rows: int = 65536) -> Rounding:
@@ -206,12 +167,7 @@ def check_positions(source: SceneSource, format: Format, force_lossy: bool = Fal
     """Refuse a scene whose positions a format cannot hold, and warn of Gaussians that it moves.
 
     Of a scene far from zero, every position is held to a tenth of the smallest splat, or nearly as well as at zero. Of
-    others, most Gaussians move by less than their own size.
-
-    Returns
-    -------
-    tuple of str
-        Warnings: empty, or how many Gaussians move by more than their own size.
+    others, most Gaussians move by less than their own size. Returns warnings: none, or how many move by more.
     """
     found = rounding_of(source, format)
     too_coarse = found.error > found.smallest / 10 and bool(np.any(source.origin)) and not force_lossy
@@ -263,10 +219,7 @@ def offset_place(path: str | os.PathLike[str]) -> Path:
 def write_offset(path: str | os.PathLike[str], origin: np.ndarray, format: Format, force: bool) -> str:
     """Write how far a scene was moved, in the axes of the file at `path`. Returns a note.
 
-    Raises
-    ------
-    InputError
-        If the offset's file exists and `force` is not set.
+    Raises `InputError` if the offset's file exists and `force` is not set.
     """
     place, offset = offset_place(path), (origin * format.frame.signs + 0.0).tolist()
     with atomic_write(place, force) as file:
@@ -281,10 +234,6 @@ class MovedSource(WrappedSource):
         super().__init__(parent)
         self.origin = origin
 
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
-        return self.parent.read(rows, fields, out)
-
 
 class _WorldSource(WrappedSource):
     """A scene as writers need it: world positions in float32, and unit quaternions.
@@ -297,11 +246,8 @@ class _WorldSource(WrappedSource):
         self.origin = parent.origin if keep_origin else np.zeros(3)
         self.moved = bool(np.any(parent.origin != self.origin))
 
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
-        planes = self.parent.read(rows, fields, out)
+    def change(self, planes: Planes) -> None:
         if "quats" in planes:
             planes["quats"][...] = normalize_quats(planes["quats"])
         if "means" in planes and self.moved:
             planes["means"][...] = planes["means"].astype(np.float64) + self.parent.origin[:, None]
-        return planes

@@ -1,7 +1,5 @@
 """The table of other programs' formats: suffixes, frames, readers, writers, and what searches need to know of them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,8 +18,7 @@ from flexgs_edge.io.reading import PLAIN, Reading, Writing
 
 def _as_float32(means: np.ndarray, largest: float) -> np.ndarray:
     """Half a step of float32 at each position."""
-    errors: np.ndarray = np.ldexp(0.5, np.frexp(np.abs(means).max(axis=0))[1] - 24)
-    return errors
+    return np.ldexp(0.5, np.frexp(np.abs(means).max(axis=0))[1] - 24)
 
 
 def _fixed_point(means: np.ndarray, largest: float) -> np.ndarray:
@@ -31,16 +28,12 @@ def _fixed_point(means: np.ndarray, largest: float) -> np.ndarray:
 
 def _logarithmic(means: np.ndarray, largest: float) -> np.ndarray:
     """Half a step of 16 bits over the logarithms of both signs: it grows with the distance from zero."""
-    errors: np.ndarray = (1 + np.abs(means).max(axis=0)) * (np.log1p(largest) / 65535)
-    return errors
+    return (1 + np.abs(means).max(axis=0)) * (np.log1p(largest) / 65535)
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format.
-
-    `row_bytes`, `sh_bytes`: Bytes of a fixed row of SH degree 3, and of SH among them.
-    """
+    """A format. `row_bytes`, `sh_bytes`: Bytes of a fixed row of SH degree 3, and of SH among them."""
 
     suffix: str  # End of file names, with its dot; or a whole file name
     # `module:function` of `read(path, name, reading)`, which returns a source in the file's frame. `name` is the
@@ -89,8 +82,7 @@ class Format:
 
 def _function(place: str) -> Callable[..., Any]:
     module, _, name = place.partition(":")
-    found: Callable[..., Any] = getattr(import_module(module), name)
-    return found
+    return getattr(import_module(module), name)
 
 
 _IO = "flexgs_edge.io"

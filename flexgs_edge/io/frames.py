@@ -5,16 +5,13 @@ program every scene is in INRIA's frame, RDF, which is COLMAP's. All frames have
 frame only changes signs: of positions, of quaternions and of spherical harmonics.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.source import Planes, Rows, SceneSource, WrappedSource
+from flexgs_edge.scene.source import Planes, SceneSource, WrappedSource
 
 _POSITIVE = "RDF"
 _NEGATIVE = "LUB"
@@ -70,9 +67,7 @@ class FrameSource(WrappedSource):
         self.frame = frame
         self.origin = parent.origin * frame.signs + 0.0  # no -0.0, which would show in files and messages
 
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
-        planes = self.parent.read(rows, fields, out)
+    def change(self, planes: Planes) -> None:
         with np.errstate(invalid="ignore"):  # NaN of the kind that signals; check_scene reports all of them
             if "means" in planes:
                 planes["means"] *= self.frame.signs[:, None]
@@ -80,7 +75,6 @@ class FrameSource(WrappedSource):
                 planes["quats"] *= self.frame.quat_signs[:, None]
             if "sh_rest" in planes and self.sh_degree:
                 planes["sh_rest"] *= np.tile(self.frame.sh_signs(self.sh_degree), 3)[:, None]
-        return planes
 
 
 def in_frame(source: SceneSource, frame: Frame) -> SceneSource:

@@ -7,8 +7,6 @@ With `--glb spz`, the buffer is a `.spz` (`io.gltf` has the source), and accesso
 CesiumJS takes buffer view 0 whatever the file says, and asks for a node with a matrix and for both extensions as required ones.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct
@@ -182,21 +180,18 @@ def linear_scales(planes: Planes) -> np.ndarray:
     """[3, n] f64, standard deviations."""
     # Neither zero nor infinite, which a reader could not take back.
     limits = np.finfo(np.float32)
-    found: np.ndarray = np.clip(_exp(planes["log_scales"]), limits.tiny, limits.max)
-    return found
+    return np.clip(_exp(planes["log_scales"]), limits.tiny, limits.max)
 
 
 def plain_opacities(planes: Planes) -> np.ndarray:
     """[1, n] f64, 0 to 1."""
-    found: np.ndarray = 1 / (1 + _exp(-planes["opacity_logits"]))
-    return found
+    return 1 / (1 + _exp(-planes["opacity_logits"]))
 
 
 def _colours(planes: Planes) -> np.ndarray:
     """[4, n], what a viewer without splats shows: colours without SH, and opacities."""
     colours = np.clip(planes["sh_dc"].astype(np.float64) * SH_C0 + 0.5, 0, 1)
-    found: np.ndarray = np.concatenate([colours, plain_opacities(planes)])
-    return found
+    return np.concatenate([colours, plain_opacities(planes)])
 
 
 def _exp(values: np.ndarray) -> np.ndarray:
@@ -207,5 +202,4 @@ def _exp(values: np.ndarray) -> np.ndarray:
     total: np.ndarray = np.ones_like(rest)
     for term in range(_TERMS, 0, -1):
         total = 1 + rest * total / term
-    result: np.ndarray = np.ldexp(total, power.astype(np.int32))
-    return result
+    return np.ldexp(total, power.astype(np.int32))

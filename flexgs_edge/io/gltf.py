@@ -21,18 +21,15 @@ circle about y), the values are taken as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from flexgs_edge.errors import FormatError, InputError, brief
-from flexgs_edge.io.decoded import DecodedSource
 from flexgs_edge.io.frames import LUF, RUB, in_frame
 from flexgs_edge.io.gltf_container import GltfFile, Packed
-from flexgs_edge.io.gltf_json import Record
-from flexgs_edge.io.gltf_nodes import Move, shown_meshes
-from flexgs_edge.io.gltf_splats import AttributeSplats, GltfSource, Splats, SpzSplats
+from flexgs_edge.io.gltf_splats import AttributeSplats, GltfSource, Move, Splats, SpzSplats, shown_meshes
+from flexgs_edge.io.json_object import JsonObject
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.scene.source import SceneSource
 
@@ -62,40 +59,22 @@ def read_gltf(path: Path, name: str, reading: Reading) -> GltfSource:
     is damaged.
     """
     file = GltfFile(path, name)
-    unknown = [word for word in file.json.texts("extensionsRequired") if not _is_known(word)]
+    unknown = [
+        word for word in file.json.texts("extensionsRequired") if word not in _KNOWN and not word.startswith(_HARMLESS)
+    ]
     if unknown:
         words = ", ".join(brief(word) for word in unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
         raise InputError(
             f"{name}: needs extensions that we do not know: {words}; convert it with a program that knows them"
         )
-    return splats_of(file, _unpack_spz)
-
-
-def splats_of(file: GltfFile, unpack: Callable[[bytes, str], DecodedSource]) -> GltfSource:
-    """The splats that an open file shows. See `read_gltf` for errors.
-
-    `unpack`: Opens the bytes of a `.spz`; its second argument is their name for messages.
-    """
-    return _Reader(file, unpack).scene()
-
-
-def _unpack_spz(data: bytes, name: str) -> DecodedSource:
-    # Imported only for these files, so that the others start faster.
-    from flexgs_edge.io.spz import spz_source
-
-    source: DecodedSource = spz_source(data, name)
-    return source
-
-
-def _is_known(word: str) -> bool:
-    return word in _KNOWN or word.startswith(_HARMLESS)
+    return _Reader(file).scene()
 
 
 class _Reader:
     """Collects the splats of a file."""
 
-    def __init__(self, file: GltfFile, unpack: Callable[[bytes, str], DecodedSource]) -> None:
-        self.file, self.json, self.unpack = file, file.json, unpack
+    def __init__(self, file: GltfFile) -> None:
+        self.file, self.json = file, file.json
         self.notes: dict[str, None] = dict.fromkeys(file.notes)  # in order, each of them once
         self.spz: list[SceneSource] = []
         self.attributes: list[AttributeSplats] = []
@@ -151,10 +130,10 @@ class _Reader:
         found = " and ".join(kind for kind, count in kinds.items() if count) or "a glTF without meshes"
         return f"holds {found}, not Gaussians: expected a primitive with {EXTENSION}"
 
-    def _primitives(self, mesh: int, asker: str) -> list[Record]:
+    def _primitives(self, mesh: int, asker: str) -> list[JsonObject]:
         record = self.json.item("meshes", mesh, asker)
         values = record.items("primitives")
-        return [Record(record.name, f"{record.place}.primitives[{i}]", value) for i, value in enumerate(values)]
+        return [JsonObject(record.name, value, f"{record.place}.primitives[{i}]") for i, value in enumerate(values)]
 
     def _mesh(self, mesh: int, asker: str) -> list[Splats]:
         """The splats of a mesh, without empty ones."""
@@ -188,7 +167,7 @@ class _Reader:
         if "skin" in node:
             self.notes["skins left out"] = None
 
-    def _note_differences(self, primitive: Record) -> None:
+    def _note_differences(self, primitive: JsonObject) -> None:
         """Note what we would draw in another way."""
         if primitive.whole("mode", 4) != 0:
             self.notes["splats whose mode is not POINTS are read as points"] = None
@@ -206,7 +185,7 @@ class _Reader:
             if word not in SPZ_EXTENSIONS:
                 self.notes[f"extension {brief(word, 60)} ignored"] = None
 
-    def _attributes(self, primitive: Record) -> AttributeSplats:
+    def _attributes(self, primitive: JsonObject) -> AttributeSplats:
         attributes = _Attributes(self.file, primitive)
         means = attributes.get("POSITION", 3)
         dc = attributes.find(_coefficient(0, 0), (3,))
@@ -224,7 +203,7 @@ class _Reader:
                 break
             rest += [packed for packed in band if packed is not None]
             degree += 1
-        if len(rest) < sum(_is_rest(key) for key in attributes.record.value):
+        if len(rest) < sum("SH_DEGREE_" in key and "SH_DEGREE_0" not in key for key in attributes.record.value):
             self.notes[f"SH above degree {degree} left out: they are incomplete, or of a degree above {_DEGREES}"] = (
                 None
             )
@@ -257,10 +236,13 @@ class _Reader:
             for splats in self.attributes:
                 splats.as_logs = True
 
-    def _spz(self, primitive: Record, record: Record) -> SpzSplats:
+    def _spz(self, primitive: JsonObject, record: JsonObject) -> SpzSplats:
+        # Imported only for these files, so that the others start faster.
+        from flexgs_edge.io.spz import spz_source
+
         index = record.whole("bufferView")
         data = self.file.view(index, record.place).tobytes()
-        source = self.unpack(data, f"{self.file.name}: {primitive.place}: the .spz in bufferViews[{index}]")
+        source = spz_source(data, f"{self.file.name}: {primitive.place}: the .spz in bufferViews[{index}]")
         self.spz.append(source)
         self.notes |= dict.fromkeys(source.notes)
         if not source.count:
@@ -276,7 +258,7 @@ class _Reader:
                     return SpzSplats(source)
         return SpzSplats(turned)
 
-    def _stated_bounds(self, primitive: Record) -> np.ndarray | None:
+    def _stated_bounds(self, primitive: JsonObject) -> np.ndarray | None:
         """[2, 3] f64, the least and the largest position that the file states, if it does."""
         attributes = primitive.inner("attributes")
         if "POSITION" not in attributes:
@@ -284,13 +266,13 @@ class _Reader:
         record = self.json.item("accessors", attributes.whole("POSITION"), attributes.place)
         if "min" not in record or "max" not in record:
             return None
-        return np.stack([record.numbers("min", (0, 0, 0)), record.numbers("max", (0, 0, 0))])
+        return np.stack([record.numbers("min", 3), record.numbers("max", 3)])
 
 
 class _Attributes:
     """Attributes of a primitive, by their names without the extension's."""
 
-    def __init__(self, file: GltfFile, primitive: Record) -> None:
+    def __init__(self, file: GltfFile, primitive: JsonObject) -> None:
         self.file, self.record = file, primitive.inner("attributes")
         self.count: int | None = None
 
@@ -326,11 +308,7 @@ def _coefficient(degree: int, number: int) -> str:
     return f"SH_DEGREE_{degree}_COEF_{number}"
 
 
-def _is_rest(key: str) -> bool:
-    return "SH_DEGREE_" in key and "SH_DEGREE_0" not in key
-
-
-def _spz_record(primitive: Record) -> Record | None:
+def _spz_record(primitive: JsonObject) -> JsonObject | None:
     """The object that names a primitive's `.spz`, if it has one."""
     outer = primitive.inner("extensions")
     for word in SPZ_EXTENSIONS:

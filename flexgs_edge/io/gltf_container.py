@@ -4,8 +4,6 @@ Every offset, stride and count is checked against the bytes that are there befor
 beside the `.gltf`, `data:` URIs or the second chunk of a `.glb`; nothing outside the file's folder is opened.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import re
@@ -17,7 +15,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from flexgs_edge.errors import FormatError, brief
-from flexgs_edge.io.gltf_json import Record, load_record
+from flexgs_edge.files import parse_json
+from flexgs_edge.io.json_object import JsonObject
 from flexgs_edge.scene.source import Rows
 
 MAGIC = b"glTF"
@@ -85,7 +84,7 @@ class GltfFile:
             raise FormatError(
                 f"{name}: not a glTF: expected it to begin with 'glTF' or '{{', found {brief(text[:8])}; is it complete?"
             )
-        self.json = load_record(text, name)
+        self.json = JsonObject(name, parse_json(text, name))
         asset = self.json.inner("asset").text("version", "none")
         if asset.partition(".")[0] != "2":
             raise FormatError(f"{name}: asset.version: expected 2.0, found {brief(asset)}")
@@ -140,7 +139,7 @@ class GltfFile:
         """Bytes of all accessors that were read."""
         return sum(packed.values.nbytes for packed in self._packed.values())
 
-    def _read_accessor(self, record: Record) -> Packed:
+    def _read_accessor(self, record: JsonObject) -> Packed:
         count, component, width = record.whole("count"), record.whole("componentType"), record.text("type")
         if component not in COMPONENTS or component == 5125:
             raise record.fail("componentType", "5120 to 5123 or 5126", component)
@@ -165,7 +164,7 @@ class GltfFile:
             self._replace(record.inner("sparse"), values)
         return Packed(values, normalized)
 
-    def _replace(self, record: Record, values: np.ndarray) -> None:
+    def _replace(self, record: JsonObject, values: np.ndarray) -> None:
         """Put the sparse values of an accessor in their places."""
         count, place = record.whole("count"), record.inner("indices")
         component = place.whole("componentType")
@@ -180,7 +179,7 @@ class GltfFile:
         inner = record.inner("values")
         values[rows] = self._read_rows(inner, inner.whole("bufferView"), count, values.dtype, values.shape[1])
 
-    def _read_rows(self, record: Record, view: int, count: int, kind: np.dtype, columns: int) -> np.ndarray:
+    def _read_rows(self, record: JsonObject, view: int, count: int, kind: np.dtype, columns: int) -> np.ndarray:
         """[count, columns], rows of a buffer view, without the bytes between them."""
         buffer, start, length, stride = self._view(view, record.place)
         size, offset = kind.itemsize * columns, record.whole("byteOffset", 0)
@@ -235,7 +234,7 @@ class GltfFile:
             self._buffers[index] = _Buffer(length, buffer.data, buffer.path, buffer.start)
         return self._buffers[index]
 
-    def _open_buffer(self, record: Record, index: int) -> _Buffer:
+    def _open_buffer(self, record: JsonObject, index: int) -> _Buffer:
         if "uri" not in record:
             if index == 0 and self._chunk is not None:
                 return self._chunk
@@ -258,7 +257,7 @@ class GltfFile:
         self._opened.add(place)
         return _Buffer(size, path=place)
 
-    def _beside(self, record: Record, uri: str) -> Path:
+    def _beside(self, record: JsonObject, uri: str) -> Path:
         """The file of a relative URI, which must lie in the folder of the scene."""
         if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri):
             raise record.fail("uri", "the name of a file beside the scene, or a data URI", uri)

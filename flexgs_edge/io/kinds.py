@@ -1,7 +1,5 @@
 """Say what a file is by its first bytes, and what to do next, for files that are no scene or have the wrong suffix."""
 
-from __future__ import annotations
-
 import os
 import re
 import zipfile

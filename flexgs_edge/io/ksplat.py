@@ -5,8 +5,6 @@ partly filled buckets, the centres of its buckets, then the Gaussians, bucket by
 hold positions as 16 bits around their bucket's centre and float16; level 2 has SH of 8 bits. All is little endian.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +13,11 @@ import numpy as np
 
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import FormatError
-from flexgs_edge.io.decoded import DecodedSource, opacity_logits
+from flexgs_edge.io.decoded import PartsSource, opacity_logits
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.io.splat import logs
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.source import Rows, by_chunk
+from flexgs_edge.scene.source import Rows
 
 _HEADER_BYTES, _SECTION_BYTES, _CENTRE_BYTES = 4096, 1024, 12
 _MAX_DEGREE = 3
@@ -72,64 +70,49 @@ class _Section:
     middle: int  # code of a bucket's centre
 
 
-class KsplatSource(DecodedSource):
+class KsplatSource(PartsSource):
     """A `.ksplat`: its sections, decoded when they are read."""
 
     def __init__(
         self, name: str, level: int, sections: list[_Section], sh_range: tuple[float, float], held_bytes: int
     ) -> None:
-        degree = max((section.sh_degree for section in sections), default=0)
-        sizes = [len(section.table) for section in sections]
-        super().__init__(name, sum(sizes), degree, held_bytes)
+        sizes, degrees = [len(section.table) for section in sections], [section.sh_degree for section in sections]
+        super().__init__(name, sizes, degrees, held_bytes)
         self._level, self._sections, self._sh_range = _LEVELS[level], sections, sh_range
-        self._starts = np.cumsum([0, *sizes[:-1]])
 
-    def decode(self, rows: Rows, field: str) -> np.ndarray:
-        """See `DecodedSource.decode`."""
-        size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
-        found = np.zeros((self.width(field), size))
-        for number, some, part in by_chunk(rows, self._starts):
-            start = int(self._starts[number])
-            own = slice(some.start - start, some.stop - start) if isinstance(some, slice) else some - start
-            self._decode_section(self._sections[number], own, field, found[:, part])
-        return found
-
-    def _decode_section(self, section: _Section, rows: Rows, field: str, out: np.ndarray) -> None:
+    def decode_part(self, number: int, rows: Rows, field: str) -> np.ndarray:
+        section = self._sections[number]
         kind, place = self._level.place(field, 3 * sh_rest_count(section.sh_degree))
-        codes = np.ascontiguousarray(section.table[rows, place]).view(kind).T
+        codes: np.ndarray = np.ascontiguousarray(section.table[rows, place]).view(kind).T
         if field == "means" and kind != "<f4":
             numbers = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
             centres = section.centres[np.searchsorted(section.ends, numbers, side="right")]
-            out[:] = (codes.astype(np.float64) - section.middle) * section.step + centres.T
-        elif field == "log_scales":
-            out[:] = logs(codes)
-        elif field == "sh_dc":
-            out[:] = (codes / 255.0 - 0.5) / SH_C0
-        elif field == "opacity_logits":
-            out[:] = opacity_logits(codes / 255.0)
-        elif field == "sh_rest":
+            return np.asarray((codes.astype(np.float64) - section.middle) * section.step + centres.T)
+        if field == "log_scales":
+            return logs(codes)
+        if field == "sh_dc":
+            return np.asarray((codes / 255.0 - 0.5) / SH_C0)
+        if field == "opacity_logits":
+            return opacity_logits(codes / 255.0)
+        if field == "sh_rest":
             low, high = self._sh_range
             values = low + codes / 255.0 * (high - low) if kind == "u1" else codes
-            out[_sh_places(section.sh_degree, self.sh_degree)] = values
-        else:
-            out[:] = codes
+            return np.asarray(values[np.argsort(_sh_places(section.sh_degree))])
+        return codes
 
 
-def _sh_places(section_degree: int, degree: int) -> np.ndarray:
+def _sh_places(degree: int) -> list[int]:
     """Our channel of each SH value of a row: the file has degree by degree, within it channel by channel."""
-    count, places = sh_rest_count(degree), list[int]()
-    for each in range(1, section_degree + 1):
+    places = list[int]()
+    for each in range(1, degree + 1):
         for channel in range(3):
-            start = channel * count + sh_rest_count(each - 1)
+            start = channel * sh_rest_count(degree) + sh_rest_count(each - 1)
             places += range(start, start + 2 * each + 1)
-    return np.array(places, np.int64)
+    return places
 
 
 def read_ksplat(path: Path, name: str, reading: Reading) -> KsplatSource:
-    """Open a `.ksplat`; see `Format.reader`.
-
-    Raises `FormatError` if the file breaks the format.
-    """
+    """Open a `.ksplat`; see `Format.reader`. Raises `FormatError` if the file breaks the format."""
     data = np.fromfile(path, np.uint8)
     if len(data) < _HEADER_BYTES:
         raise FormatError(

@@ -1,7 +1,5 @@
 """Find the scene in INRIA's model folders, and the cameras and photos beside a scene."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -4,8 +4,6 @@ Files are read with plain reads into a small block, and not mapped. Mapped pages
 process, and a mapped file that shrinks would kill it.
 """
 
-from __future__ import annotations
-
 import io
 import os
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Parse PLY headers, and check their claims against the size of the file before anything is allocated."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
@@ -13,23 +11,10 @@ from flexgs_edge.scene.fields import FIELD, FIELDS, sh_rest_count
 from flexgs_edge.scene.source import REST_WIDTHS
 
 _TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
 _NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20

@@ -4,8 +4,6 @@ Vectors become whole numbers first, so small that float32 holds all their produc
 every library of linear algebra then finds the same palette.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

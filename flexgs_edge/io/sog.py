@@ -5,17 +5,23 @@ Each pixel is a Gaussian. Pictures have the same order of rows, and pixels behin
 
 from __future__ import annotations
 
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.errors import FormatError
+from flexgs_edge.errors import FormatError, brief
+from flexgs_edge.files import parse_json
 from flexgs_edge.io.codes import unpack_small
-from flexgs_edge.io.decoded import DecodedSource
+from flexgs_edge.io.decoded import DecodedSource, opacity_logits
 from flexgs_edge.io.exact_pictures import is_lossy, picture_size, read_pixels
-from flexgs_edge.io.pieces import Pieces, folder_pieces, open_zip, zip_pieces
+from flexgs_edge.io.json_object import JsonObject
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.io.sog_meta import BANDS, SogMeta, parse_meta
 from flexgs_edge.scene.source import Rows
 
 META = "meta.json"
@@ -28,11 +34,29 @@ _PIXEL_BYTES = 4
 _SPARE_PIXELS = 1 << 16
 _PIXELS_A_ROW = 4
 """Pictures may hold the first number of pixels, and the second for each row: some writers round sides up."""
+Pieces = Callable[[str], bytes]  # Gives the bytes of a piece by its name; raises `FormatError` if it is not there
+
+_MOST_UNPACKED = 1 << 22
+_MOST_GAIN = 8
+"""A piece of a zip unpacks to at most this many bytes, and this many times its packed size. Pictures do not get smaller by
+a second compression."""
+_DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError),
+    *(OSError, OverflowError, IndexError, KeyError),
+)  # What zipfile raises for files that it cannot read
+LEVELS = 256  # Values of a byte
+BANDS: dict[int, int] = {1: 3, 2: 8, 3: 15}  # SH coefficients above degree 0 of one colour channel, by SH degree
+_MOST_COUNT = 2**31 - 1
 
 
 def read_sog(path: Path, name: str, reading: Reading) -> SogSource:
     """Open a `.sog`; see `read_foreign`."""
-    with open_zip(path, name) as archive:
+    path.stat()  # the file can be read, or this error says why not
+    try:
+        archive = zipfile.ZipFile(path)
+    except _DAMAGED as error:
+        raise FormatError(f"{name}: expected a zip ({error}); is it complete?") from error
+    with archive:
         return read_pieces(zip_pieces(archive, name, META), META, name, reading)
 
 
@@ -119,7 +143,6 @@ class SogSource(DecodedSource):
         self.version = meta.version
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
-        """See `DecodedSource.decode`."""
         if field == "means":
             lowest, highest = self._meta.bounds[:, :, None]
             share = self._means[rows].T / 65535
@@ -168,3 +191,156 @@ def _read_palette(meta: SogMeta, data: bytes, place: str) -> tuple[int, np.ndarr
     with np.errstate(over="ignore"):  # values beyond float32 become infinite, and check_scene reports them
         palette[:entries] = meta.sh.astype(np.float32)[codes.transpose(0, 2, 1).reshape(entries, -1)]
     return degree, palette
+
+
+def piece_place(folder: Path, piece: str, name: str) -> Path:
+    """The file of a piece below a folder. Raises `FormatError` if the name leads out of the folder, also by a link."""
+    inside = f"{name}: {brief(piece)}: expected the name of a file in its folder or below it"
+    if not piece or "\\" in piece or ":" in piece or os.path.isabs(piece) or ".." in piece.split("/"):
+        raise FormatError(inside)
+    try:
+        root, place = os.path.realpath(folder), os.path.realpath(folder / piece)
+    except (OSError, ValueError):
+        raise FormatError(f"{inside}, found one that no file can have") from None
+    if os.path.commonpath([root, place]) != root:
+        raise FormatError(f"{inside}, found a link that leads out of it")
+    return Path(place)
+
+
+def is_there(folder: Path, piece: str, name: str) -> bool:
+    """Whether a piece below a folder is a file."""
+    try:
+        return piece_place(folder, piece, name).is_file()
+    except OSError:  # such as a name that is too long
+        return False
+
+
+def folder_pieces(folder: Path, name: str) -> Pieces:
+    """Pieces that are files in a folder or below it. `name` is what messages call the scene."""
+
+    def read(piece: str) -> bytes:
+        place = piece_place(folder, piece, name)
+        if not is_there(folder, piece, name):
+            raise FormatError(f"{name}: {brief(piece)}: no such file in its folder; was everything copied?")
+        return place.read_bytes()
+
+    return read
+
+
+def zip_pieces(archive: zipfile.ZipFile, name: str, first: str) -> Pieces:
+    """Pieces in a zip."""
+    entries = {info.filename: info for info in archive.infolist()}
+    homes = [entry[: -len(first)] for entry in entries if entry == first or entry.endswith(f"/{first}")]
+    if not homes:
+        raise FormatError(f"{name}: expected a zip with {first}, found {brief(sorted(entries))}")
+    home = min(homes, key=len)
+
+    def read(piece: str) -> bytes:
+        info = entries.get(home + piece)
+        if info is None:
+            raise FormatError(f"{name}: {brief(piece)}: not in the zip; found {brief(sorted(entries), 200)}")
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FormatError(
+                f"{name}: {piece}: expected a stored or deflated entry, found method {info.compress_type}"
+            )
+        if info.file_size > _MOST_UNPACKED + _MOST_GAIN * info.compress_size:
+            raise FormatError(
+                f"{name}: {piece}: {info.compress_size} bytes claim to unpack to {info.file_size}: no picture does that"
+            )
+        try:
+            with archive.open(info) as file:
+                return file.read(info.file_size)
+        except _DAMAGED as error:
+            raise FormatError(f"{name}: {piece}: cannot be unpacked ({error}); is the file complete?") from error
+
+    return read
+
+
+@dataclass(frozen=True)
+class SogMeta:
+    """What `meta.json` says, with the values of bytes as tables: both versions then decode alike."""
+
+    version: int  # 1 or 2
+    count: int  # Gaussians
+    antialiased: bool  # whether the model is drawn antialiased
+    bounds: np.ndarray  # [2, 3] f64, lowest and highest positions in the log map
+    scales: np.ndarray  # [3, 256] f64, log-scales of the bytes
+    sh0: np.ndarray  # [4, 256] f64, SH coefficients of degree 0 of the bytes, and opacity logits
+    sh: np.ndarray | None  # [256] f64, SH coefficients above degree 0 of the bytes; `None` if the scene has none
+    sh_degree: int | None  # As the file states it. `None`: it follows from the width of the palette's picture.
+    palette: int | None  # Entries of the palette. `None`: as many as its picture holds.
+    # Names of the pictures: `means_l`, `means_u`, `quats`, `scales`, `sh0`, `centroids`, `labels`.
+    files: dict[str, str]
+
+
+def parse_meta(data: bytes, place: str) -> SogMeta:
+    """Check a `meta.json`. Raises `FormatError` if a field is missing or wrong, or the version is unknown."""
+    top = JsonObject(place, parse_json(data, place))
+    version = top.whole("version", 1, 1, 2)
+    means = top.needed("means")
+    if version == 2:
+        count = top.whole("count", most=_MOST_COUNT)
+    else:
+        shape = means.value.get("shape")
+        if not isinstance(shape, list) or not shape or type(shape[0]) is not int or not 0 <= shape[0] <= _MOST_COUNT:
+            raise means.fail("shape", f"a list that begins with the count, 0 to {_MOST_COUNT}")
+        count = shape[0]
+    antialiased = top.value.get("antialias") or False
+    if not isinstance(antialiased, bool):
+        raise top.fail("antialias", "true or false")
+    scales, sh0 = top.needed("scales"), top.needed("sh0")
+    files = dict(zip(("means_l", "means_u"), means.names("files", 2)))
+    files["quats"] = top.needed("quats").names("files", 1)[0]
+    files["scales"], files["sh0"] = scales.names("files", 1)[0], sh0.names("files", 1)[0]
+    if version == 2:
+        scale_table = np.tile(_codebook(scales), (3, 1))
+        colours = np.tile(_codebook(sh0), (3, 1))
+        sh0_table = np.concatenate([colours, opacity_logits(np.arange(LEVELS) / 255)[None]])
+    else:
+        scale_table, sh0_table = _ramps(scales, 3), _ramps(sh0, 4)
+    table, degree, palette = None, None, None
+    if "shN" in top:
+        sh = top.needed("shN")
+        degree = sh.whole("bands", most=max(BANDS)) if "bands" in sh else None
+        if degree != 0:
+            palette = sh.whole("count", None, 1, 65536) if "count" in sh else None
+            table = _codebook(sh) if version == 2 else _ramp(sh)
+            files.update(zip(("centroids", "labels"), sh.names("files", 2)))
+    return SogMeta(
+        version=version,
+        count=count,
+        antialiased=antialiased,
+        bounds=np.stack([means.numbers("mins", 3), means.numbers("maxs", 3)]),
+        scales=scale_table,
+        sh0=sh0_table,
+        sh=table,
+        sh_degree=degree if table is not None else 0,
+        palette=palette,
+        files=files,
+    )
+
+
+def _codebook(part: JsonObject) -> np.ndarray:
+    """[256] f64; entries beyond the end of a shorter list are NaN, which `check_scene` reports with their rows."""
+    value = part.value.get("codebook")
+    if isinstance(value, list) and len(value) == LEVELS and value[0] is None and None not in value[1:]:
+        # An early writer left the first entry out. PlayCanvas continues the list downwards by its mean step.
+        rest = JsonObject(part.name, {"codebook": value[1:]}, part.place).numbers("codebook", LEVELS - 1)
+        return np.concatenate([[rest[0] + (rest[0] - rest[-1]) / 255], rest])
+    numbers = part.numbers("codebook", 1, LEVELS)
+    return np.concatenate([numbers, np.full(LEVELS - len(numbers), np.nan)])
+
+
+def _ramps(part: JsonObject, width: int) -> np.ndarray:
+    """[width, 256] f64, equal steps between the ends of each channel."""
+    return _steps(part.numbers("mins", width)[:, None], part.numbers("maxs", width)[:, None])
+
+
+def _ramp(part: JsonObject) -> np.ndarray:
+    """[256] f64, equal steps between two numbers."""
+    return _steps(np.float64(part.number("mins")), np.float64(part.number("maxs")))
+
+
+def _steps(lowest: np.ndarray | np.float64, highest: np.ndarray | np.float64) -> np.ndarray:
+    shares = np.arange(LEVELS) / 255
+    return np.asarray(lowest * (1 - shares) + highest * shares)

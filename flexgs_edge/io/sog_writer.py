@@ -3,8 +3,6 @@
 Rows are pixels in the order that they come in. SH above degree 0 become a palette, so this is where the format loses most.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 from typing import Any, BinaryIO
@@ -33,10 +31,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_sog(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
-    """Write a `.sog`; see `write_foreign`.
-
-    Raises `InputError` if the scene has more Gaussians than a picture has pixels.
-    """
+    """Write a `.sog`; see `write_foreign`. Raises `InputError` if the scene has more Gaussians than a picture has pixels."""
     if source.count > _LARGEST_SIDE**2:
         raise InputError(
             f"{source.name}: a .sog holds at most {_LARGEST_SIDE**2} Gaussians, this scene has {source.count}: write a .spz"

@@ -4,8 +4,6 @@ Little endian: position (3 float32), standard deviations (3 float32), red, green
 w x y z (4 bytes, (code - 128) / 128). Colours include the constant 0.5.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import BinaryIO
 
@@ -40,7 +38,6 @@ class SplatSource(DecodedSource):
         self._table = table
 
     def decode(self, rows: Rows, field: str) -> np.ndarray:
-        """See `DecodedSource.decode`."""
         codes = np.ascontiguousarray(self._table[rows, _PARTS[field]])
         if field == "means":
             return codes.view("<f4").T
@@ -101,5 +98,4 @@ def _floats(planes: np.ndarray) -> np.ndarray:
 def _largest_negative(quats: np.ndarray) -> np.ndarray:
     """Quaternions with the sign that makes the largest component negative: the codes hold -1, but not 1."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=0)[None], axis=0)
-    turned: np.ndarray = np.where(largest > 0, -quats, quats)
-    return turned
+    return np.where(largest > 0, -quats, quats)

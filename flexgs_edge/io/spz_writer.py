@@ -1,7 +1,5 @@
 """Write `.spz` files, versions 3 and 4."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable, Iterator
@@ -13,7 +11,7 @@ from deflate import gzip_compress
 
 from flexgs_edge.io.codes import nearest, opacities, without_largest
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.io.spz_layout import (
+from flexgs_edge.io.spz import (
     ANTIALIASED,
     COLOUR_SCALE,
     FIRST_PLAIN,
@@ -139,8 +137,7 @@ def smallest_three(quats: np.ndarray) -> np.ndarray:
     largest, others = without_largest(quats[[1, 2, 3, 0]])
     sizes = nearest(np.abs(others) * (ROTATION_MASK / math.sqrt(0.5)), ROTATION_MASK)
     parts = sizes | np.where(others < 0, np.uint32(ROTATION_MASK + 1), np.uint32(0))
-    words: np.ndarray = largest.astype(np.uint32) << 30 | parts[0] << 20 | parts[1] << 10 | parts[2]
-    return words
+    return largest.astype(np.uint32) << 30 | parts[0] << 20 | parts[1] << 10 | parts[2]
 
 
 _CODES: dict[str, Callable[[np.ndarray], np.ndarray]] = {

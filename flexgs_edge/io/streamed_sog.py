@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.errors import FormatError, InputError, brief
-from flexgs_edge.io.decoded import DecodedSource
-from flexgs_edge.io.pieces import is_there, piece_place
+from flexgs_edge.files import parse_json
+from flexgs_edge.io.decoded import PartsSource
+from flexgs_edge.io.json_object import JsonObject
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.io.sog import META, SogSource, read_sog, read_sog_folder
-from flexgs_edge.io.sog_meta import JsonObject, parse_object
-from flexgs_edge.scene.fields import FIELD, sh_rest_count
-from flexgs_edge.scene.source import Rows, by_chunk
+from flexgs_edge.io.sog import META, SogSource, is_there, piece_place, read_sog, read_sog_folder
+from flexgs_edge.scene.source import Rows
 
 _MOST_LEVELS = 64
 _MOST_ROWS = 2**31 - 1
@@ -44,10 +43,10 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
     Raises `InputError` if the level is not there. Raises `FormatError` if a file is damaged, or ranges do not fit the
     files that they name.
     """
-    top = parse_object(path.read_bytes(), f"{name}: lod-meta.json")
-    if top.has("version"):
-        top.integer("version", 1, 1)
-    levels = top.integer("lodLevels", 1, _MOST_LEVELS)
+    place = f"{name}: lod-meta.json"
+    top = JsonObject(place, parse_json(path.read_bytes(), place))
+    top.whole("version", 1, 1, 1)
+    levels = top.whole("lodLevels", None, 1, _MOST_LEVELS)
     files = top.names("filenames")
     ranges = _ranges(top, levels, len(files))
     here = cache(lambda file: is_there(path.parent, files[file], name))
@@ -70,8 +69,8 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
     scenes = {file: opened(files[file]) for file in sorted(first.values())}
     _check_ranges(top, level_ranges, scenes, files)
     parts = [(scenes[part.file], part.offset, part.count) for part in level_ranges]
-    if top.has("environment") and top.value["environment"] != "":
-        environment = top.name("environment")
+    if "environment" in top and top.value["environment"] != "":
+        environment = top.text("environment")
         if is_there(path.parent, environment, name):
             scene = opened(environment)
             parts.append((scene, 0, scene.count))
@@ -83,7 +82,7 @@ def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource
     return source
 
 
-class StreamedSource(DecodedSource):
+class StreamedSource(PartsSource):
     """Ranges of rows of several SOG scenes, one behind the other.
 
     `name`: what messages call it. `parts`: a scene, its first row and the number of rows of each range; none of them
@@ -92,63 +91,51 @@ class StreamedSource(DecodedSource):
 
     def __init__(self, name: str, parts: Sequence[tuple[SogSource, int, int]], notes: tuple[str, ...]) -> None:
         self._parts = parts
-        counts = [count for _, _, count in parts]
-        self._starts = np.cumsum([0, *counts], dtype=np.int64)[:-1]
         scenes = {id(scene): scene for scene, _, _ in parts}.values()
-        degree = max((scene.sh_degree for scene in scenes), default=0)
-        super().__init__(name, sum(counts), degree, sum(scene.held_bytes for scene in scenes))
+        held = sum(scene.held_bytes for scene in scenes)
+        super().__init__(name, [count for _, _, count in parts], [scene.sh_degree for scene, _, _ in parts], held)
         self.notes = tuple(dict.fromkeys([*notes, *(note for scene in scenes for note in scene.notes)]))
         if any(scene.settings for scene in scenes):
             self.settings = {"antialiased": True}
 
-    def decode(self, rows: Rows, field: str) -> np.ndarray:
-        """See `DecodedSource.decode`."""
-        size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
-        values = np.zeros((FIELD[field].width(self.sh_degree), size))
-        for number, some, place in by_chunk(rows, self._starts):
-            scene, offset, _ = self._parts[number]
-            shift = offset - int(self._starts[number])
-            moved: Rows = slice(some.start + shift, some.stop + shift) if isinstance(some, slice) else some + shift
-            if field != "sh_rest":
-                values[:, place] = scene.decode(moved, field)
-            elif scene.sh_degree:  # of a lower degree than others, perhaps
-                inner = scene.decode(moved, field).reshape(3, sh_rest_count(scene.sh_degree), -1)
-                values.reshape(3, -1, size)[:, : inner.shape[1], place] = inner
-        return values
+    def decode_part(self, number: int, rows: Rows, field: str) -> np.ndarray:
+        scene, offset, _ = self._parts[number]
+        moved: Rows = slice(rows.start + offset, rows.stop + offset) if isinstance(rows, slice) else rows + offset
+        return scene.decode(moved, field)
 
 
 def _ranges(top: JsonObject, levels: int, files: int) -> list[list[_Range]]:
     """The ranges of every level, in the order of the tree's leaves, without empty ones."""
     ranges: list[list[_Range]] = [[] for _ in range(levels)]
-    waiting = [top.inner("tree")]
+    waiting = [top.needed("tree")]
     while waiting:
         node = waiting.pop()
-        if node.has("lods"):
-            lods = node.inner("lods")
+        if "lods" in node:
+            lods = node.needed("lods")
             for key in lods.value:
                 if not (key.isascii() and key.isdigit() and len(key) < 4 and int(key) < levels):
                     raise FormatError(
-                        f"{top.place}: {lods.path}: expected levels 0 to {levels - 1}, found {brief(key)}"
+                        f"{top.name}: {lods.place}: expected levels 0 to {levels - 1}, found {brief(key)}"
                     )
-                entry = lods.inner(key)
+                entry = lods.needed(key)
                 found = _Range(
-                    entry.integer("file", 0, files - 1),
-                    entry.integer("offset", 0, _MOST_ROWS) if entry.has("offset") else 0,
-                    entry.integer("count", 0, _MOST_ROWS),
+                    entry.whole("file", most=files - 1),
+                    entry.whole("offset", 0, most=_MOST_ROWS),
+                    entry.whole("count", most=_MOST_ROWS),
                 )
                 if found.count:
                     ranges[int(key)].append(found)
             continue
         children = node.value.get("children")
         if not isinstance(children, list):
-            raise FormatError(f"{top.place}: {node.path.rstrip('.')}: expected a node with lods or a list of children")
-        paths = [f"{node.path}children[{i}]." for i in range(len(children))]
-        waiting += [JsonObject(top.place, child, path) for child, path in zip(children, paths)][::-1]
+            raise FormatError(f"{top.name}: {node.place}: expected a node with lods or a list of children")
+        places = [f"{node.place}.children[{i}]" for i in range(len(children))]
+        waiting += [JsonObject(top.name, child, place) for child, place in zip(children, places)][::-1]
     return ranges
 
 
 def _chosen(asked: int | None, filled: list[bool], missing: list[str | None], name: str) -> tuple[int, tuple[str, ...]]:
-    """The level to read, and a note if it is not the finest of all."""
+    """The level to read, and a note if nobody asked for it and there are others."""
     there = [level for level, full in enumerate(filled) if full and missing[level] is None]
     words = ", ".join(map(str, there)) or "none"
     if asked is not None and asked not in there:
@@ -161,9 +148,11 @@ def _chosen(asked: int | None, filled: list[bool], missing: list[str | None], na
         found = f"no file {brief(first)}; was everything copied?" if first else "a tree whose leaves have no level"
         raise FormatError(f"{name}: expected a level whose files are all there, found {found}")
     level = there[0] if asked is None else asked
-    finer = [other for other in range(level) if filled[other] and other not in there]
-    note = f"level of detail {level} of {len(filled)}, the finest that is there"
-    return level, (note,) if finer and asked is None else ()
+    if asked is not None or sum(filled) == 1:
+        return level, ()
+    others = ", ".join(map(str, there[1:]))
+    advice = f"; coarser ones: --lod {others}" if others else ""
+    return level, (f"level of detail {level} of {len(filled)}, the finest that is there{advice}",)
 
 
 def _open(folder: Path, file: str, name: str, reading: Reading) -> SogSource:
@@ -184,9 +173,9 @@ def _check_ranges(
     for part in sorted(ranges, key=lambda part: (part.file, part.offset)):
         found = f"rows {part.offset} to {part.stop} of {files[part.file]}"
         if part.stop > scenes[part.file].count:
-            raise FormatError(f"{top.place}: expected {scenes[part.file].count} rows at most, found {found}")
+            raise FormatError(f"{top.name}: expected {scenes[part.file].count} rows at most, found {found}")
         if part.offset < last[part.file]:
             raise FormatError(
-                f"{top.place}: expected each row in one leaf, found {found} where others end at {last[part.file]}"
+                f"{top.name}: expected each row in one leaf, found {found} where others end at {last[part.file]}"
             )
         last[part.file] = part.stop

@@ -5,8 +5,6 @@ and so on, with larger Gaussians (`growth`); the coarsest is the preview. Viewer
 somebody looks.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -21,9 +19,8 @@ from flexgs_edge.io.reading import Writing
 from flexgs_edge.io.sog import META
 from flexgs_edge.io.sog_writer import write_sog
 from flexgs_edge.scene.curve import near_rows
-from flexgs_edge.scene.growth import GrownSource
 from flexgs_edge.scene.rotations import matrices
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scene.source import GrownSource, SceneSource
 
 STREAMED = "lod-meta.json"
 LEAF_ROWS = 1 << 19  # Most Gaussians of a part at the finest level. Smaller parts pay for more palettes.

@@ -7,8 +7,6 @@ first is missing; else the schema has a default. Prims are moved by their transf
 usd-core is loaded only for these files. It also reads what a stage refers to, wherever that lies.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import tempfile
@@ -24,8 +22,7 @@ from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import FormatError, InputError, brief
 from flexgs_edge.io.glb_writer import linear_scales, plain_opacities
 from flexgs_edge.io.gltf_container import Packed
-from flexgs_edge.io.gltf_nodes import Move
-from flexgs_edge.io.gltf_splats import AttributeSplats, GltfSource, Splats
+from flexgs_edge.io.gltf_splats import AttributeSplats, GltfSource, Move, Splats
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import SceneSource

@@ -1,7 +1,5 @@
 """The interface to kernels and memory: an OpenCL device, or the NumPy twins."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import defaultdict
@@ -12,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from flexgs_edge.constants import SSIM_SIGMA, SSIM_WINDOW
 from flexgs_edge.memory.budget import MemoryBudget
 
 
@@ -155,7 +154,6 @@ class HostArray:
         self.data = np.zeros(shape, dtype)
 
     def release(self) -> None:
-        """Free the array (once)."""
         if self.nbytes >= 0:
             self._budget.give(self.nbytes)
             self.nbytes = -1
@@ -183,39 +181,31 @@ class TwinBackend:
         self.compile_seconds = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """The name and version of NumPy, for `--json`."""
         return {"backend": "numpy", "numpy": np.__version__}
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> HostArray:
-        """A new array; its bytes are taken from the budget."""
         return HostArray(self.budget, shape, dtype)
 
     def write(self, array: HostArray, values: np.ndarray, offset: int = 0, stays: bool = False) -> None:
-        """Copy `values` to the flat element `offset` of `array`."""
         values = np.ascontiguousarray(values, array.data.dtype)
         array.data.reshape(-1)[offset : offset + values.size] = values.reshape(-1)
 
     def mapped(self, array: HostArray) -> AbstractContextManager[np.ndarray]:
-        """The array itself, without a copy."""
         return nullcontext(array.data)
 
     def mark(self) -> Callable[[], None]:
-        """A function that does nothing, since `launch` returns when the twin has run."""
-        return lambda: None
+        return lambda: None  # `launch` returns when the twin has run
 
     def read(self, array: HostArray, out: np.ndarray | None = None, offset: int = 0, waits: bool = True) -> np.ndarray:
-        """Copy `array`, from the flat element `offset` on."""
         if out is None:
             return array.data.copy()
         out.reshape(-1)[:] = array.data.reshape(-1)[offset : offset + out.size]
         return out
 
     def fill(self, array: HostArray, value: int, count: int | None = None) -> None:
-        """Set every element of an array, or the first `count` of its rows."""
         array.data[:count].fill(value)
 
     def launch(self, name: str, size: tuple[int, ...], *args: Any) -> None:
-        """Run the twin `name`."""
         start = time.perf_counter()
         with np.errstate(all="ignore"):  # kernels do not trap either; culling tests are written to fail on NaN
             self._twins[name](size, *(a.data if isinstance(a, HostArray) else a for a in args))
@@ -224,3 +214,15 @@ class TwinBackend:
 
     def close(self) -> None:
         """Do nothing: the backend holds only arrays."""
+
+
+def window(step: int = 1) -> np.ndarray:
+    """[n] f32, the weights of the Gaussian window, with the sum 1.
+
+    `step`: pixels from one row and column of a sampled picture to the next. The window covers the same part of the
+    whole picture: n is `SSIM_WINDOW` at step 1, and at least 3.
+    """
+    reach = max(SSIM_WINDOW // 2 // step, 1)
+    away = np.arange(-reach, reach + 1) * step
+    taps = np.exp(-0.5 * np.square(away / SSIM_SIGMA))
+    return (taps / taps.sum()).astype(np.float32)

@@ -1,22 +1,31 @@
-"""List the OpenCL devices, test whether they work, and choose one."""
+"""List the OpenCL devices, test whether they work, and choose one.
+
+Forms of the kernels give the same bits by other work-items. Which one is fastest is measured: docs/devices.md#forms.
+PoCL offers no device where it cannot write the folder of its compiled kernels, and ends the process where a file in it was cut:
+`prepare_compiler_cache` sees to both.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import re
+import shutil
+import struct
+import tempfile
 import warnings
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from flexgs_edge.errors import DeviceError
-from flexgs_edge.kernels.compiler_cache import prepare_compiler_cache
+from flexgs_edge.progress import LOG
 
 if TYPE_CHECKING:
     import pyopencl as cl
-
 
 HINT = (
     "install an OpenCL runtime (Debian, Ubuntu, Jetson: `apt install pocl-opencl-icd`) or run the NumPy twins with "
@@ -50,6 +59,14 @@ LEAST_STEPS = 65535
 
 
 _loaded_by: int | None = None  # the process that has loaded OpenCL runtimes
+WIDTHS = (16, 8, 4, 1)  # Lanes that a vector may have
+GPU_WIDTHS = (1, 4)
+"""Pixels of a work-item of the GPU form. With 8, llvmpipe was no faster, and took four times as long to build."""
+VARIABLE = "POCL_CACHE_DIR"  # PoCL's own environment variable for the folder
+SHARED_MEMORY = "/dev/shm"
+STAMP = "flexgs-edge-checked"  # A file whose time is that of the last check
+FLUSHED = 120.0  # Seconds after which a file is on the disk, even if the power fails
+ELF, BITCODE = b"\x7fELF\x02\x01", b"BC\xc0\xde"
 
 
 @dataclass(frozen=True)
@@ -257,3 +274,141 @@ def _broken_runtimes() -> str:
         except OSError as error:
             found.append(f"{file} names {library}, which cannot be loaded ({error})")
     return f" ({'; '.join(found)})" if found else ""
+
+
+@dataclass(frozen=True)
+class Form:
+    """One form of the kernels."""
+
+    kind: str  # a tile is blended by one work-item, or by one work-group
+    width: int  # lanes of a vector
+    written_fma: bool = False  # whether `fma` is written out in `common.clh`, for devices whose own one is slow
+
+    def __str__(self) -> str:
+        return f"{self.kind}{self.width}{'+fma' if self.written_fma else ''}"
+
+    @classmethod
+    def named(cls, name: str) -> Form | None:
+        """The form that has this name; None if none has.
+
+        >>> Form.named("gpu4+fma"), Form.named("tpu")
+        (Form(kind='gpu', width=4, written_fma=True), None)
+        """
+        match = re.fullmatch(r"(cpu|gpu)(16|8|4|1)(\+fma)?", name)
+        return cls(match[1], int(match[2]), match[3] is not None) if match else None
+
+
+def native_width(info: DeviceInfo) -> int:
+    """Lanes of the device's own vectors."""
+    return max(width for width in WIDTHS if width <= max(info.native_width, 1))
+
+
+def likely_form(info: DeviceInfo) -> Form:
+    """The form for a device of which nothing was measured: it follows the type."""
+    # A pixel takes fewer steps than a tile, so the GPU form serves devices that end loops.
+    return Form("gpu", 1) if info.type == "gpu" or info.loop_steps else Form("cpu", native_width(info))
+
+
+def possible_forms(info: DeviceInfo) -> list[Form]:
+    """Forms that the device can take, the likely one first, without those that write out `fma`."""
+    forms = [Form("gpu", width) for width in GPU_WIDTHS if 256 // width <= info.max_work_group]
+    if not info.loop_steps:
+        forms.append(Form("cpu", native_width(info)))
+    return sorted(forms, key=lambda form: form != likely_form(info))
+
+
+def with_written_fma(form: Form) -> Form:
+    """`form` with `fma` written out."""
+    return replace(form, written_fma=True)
+
+
+@cache
+def prepare_compiler_cache() -> None:
+    """Name another folder if PoCL's cannot be written, and remove its damaged entries, once in a process."""
+    folder = compiler_cache()
+    refused = _refused(folder)
+    if refused is not None:
+        places = (Path(parent) / f"flexgs-edge-{os.getuid()}" for parent in (tempfile.gettempdir(), SHARED_MEMORY))
+        other = next((place for place in places if _refused(place) is None and _is_ours(place)), None)
+        if other is None:
+            LOG.warning("%s cannot be written (%s): PoCL needs a folder there, or one in %s", folder, refused, VARIABLE)
+            return
+        LOG.warning("%s cannot be written (%s): compiled kernels are kept in %s", folder, refused, other)
+        os.environ[VARIABLE] = os.fspath(other)
+        folder = other
+    damaged = _damaged(folder)
+    for entry in damaged:
+        shutil.rmtree(folder / entry, ignore_errors=True)
+    if damaged:
+        LOG.warning("%s: %d damaged entries were removed; their kernels are compiled anew", folder, len(damaged))
+
+
+def compiler_cache() -> Path:
+    """Where PoCL keeps compiled kernels."""
+    named = os.environ.get(VARIABLE)
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(named) if named else Path(caches) / "pocl" / "kcache"
+
+
+def _refused(folder: Path) -> str | None:
+    """Why files cannot be made in a folder; None if they can."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether nobody else could have put programs there."""
+    found = folder.lstat()
+    return found.st_uid == os.getuid() and not found.st_mode & 0o022 and not folder.is_symlink()
+
+
+def _damaged(folder: Path) -> set[Path]:
+    """Entries, relative to the folder, with a file that is shorter than it states. Older files were looked at before."""
+    stamp = folder / STAMP
+    since = stamp.stat().st_mtime - FLUSHED if stamp.exists() else -1.0
+    damaged = set()
+    for place, _, names in os.walk(folder):
+        for name in names:
+            if name.endswith((".bc", ".so")) and not _is_whole(os.path.join(place, name), since):
+                damaged.add(Path(*Path(place).relative_to(folder).parts[:2]))
+    stamp.touch()
+    return damaged
+
+
+def _is_whole(path: str, since: float) -> bool:
+    """Whether a library or a program in LLVM's bitcode has the length that it states, or is older than `since`."""
+    try:
+        found = os.stat(path)
+        size = found.st_size
+        if found.st_mtime < since:
+            return True
+        with open(path, "rb") as file:
+            return _elf_bytes(file) <= size if path.endswith(".so") else _bitcode_bytes(file, size) == size
+    except (OSError, struct.error):
+        return False
+
+
+def _elf_bytes(file: BinaryIO) -> int:
+    """Where the table of sections of a library ends, which linkers write last; of a kind unknown here 1."""
+    head = file.read(64)
+    if not head.startswith(ELF):
+        return 1
+    (sections,) = struct.unpack_from("<Q", head, 40)
+    size, count = struct.unpack_from("<HH", head, 58)
+    return int(sections + size * count)
+
+
+def _bitcode_bytes(file: BinaryIO, size: int) -> int:
+    """Where the last block of a program ends; of a kind unknown here `size`."""
+    if file.read(4) != BITCODE:
+        return size or 1
+    at = 4
+    while at < size:
+        file.seek(at + 4)
+        (words,) = struct.unpack("<I", file.read(4))
+        at += 8 + 4 * words
+    return at

@@ -1,7 +1,5 @@
 """Assemble OpenCL programs: shared constants, `common.clh`, the other `.clh` helpers, and the file of the kernel."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -77,10 +75,7 @@ def _signed(text: str) -> str:
 
 
 def shared_constants() -> Iterator[tuple[str, int | float]]:
-    """Yield name and value of every number in `flexgs_edge.constants`, in order.
-
-    A tuple gives `NAME_0`, `NAME_1`, ...
-    """
+    """Yield name and value of every number in `flexgs_edge.constants`, in order. A tuple gives `NAME_0`, `NAME_1`, ..."""
     for name, value in vars(constants).items():
         if not name.isupper():
             continue

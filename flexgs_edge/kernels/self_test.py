@@ -1,19 +1,91 @@
-"""Play recorded launches back on a device, and compare every result with the twins' bits."""
+"""Play recorded launches back on a device, and compare every result with the twins' bits.
+
+A record is made by `benchmarks.self_test` on the NumPy twins and lies beside this module. A kernel whose results change needs
+a new one; a test says so.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import zlib
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, Backend, TwinBackend
-from flexgs_edge.kernels.launch_record import Record, canonical, checksum
 from flexgs_edge.memory.budget import MemoryBudget
 
 PATTERN = 0xAB  # Every byte of a new array, so that elements that are not written are known
+RECORD = Path(__file__).with_name("self_test.bin")
+EXACT_ZEROS = ("dequantize", "grid_rows")
+"""Kernels whose zeros must have the right sign too, since their values are written to files. Other kernels use `fma`, and some
+devices give it a zero of the wrong sign: docs/devices.md#the-sign-of-zero."""
+
+
+@dataclass
+class Record:
+    """Launches and what comes before them, in order."""
+
+    # `["array", number, shape, dtype]`, `["write", number, offset, blob]`, `["fill", number, value, rows or None]`,
+    # `["release", number]`, `["launch", kernel, size, arguments, outputs]`. An argument is a number, or `[number]` for
+    # an array. An output is `[place of the argument, checksum, blob with the right values or None]`.
+    steps: list[list[Any]] = field(default_factory=list)
+    # What is written, and right values where no twin can give them.
+    blobs: list[np.ndarray] = field(default_factory=list)
+
+    def keep(self, values: np.ndarray) -> int:
+        """Put values away; returns their number."""
+        self.blobs.append(np.ascontiguousarray(values).reshape(-1).copy())
+        return len(self.blobs) - 1
+
+    @property
+    def kernels(self) -> set[str]:
+        """Names of all kernels that are launched."""
+        return {step[1] for step in self.steps if step[0] == "launch"}
+
+    def pack(self) -> bytes:
+        """As bytes. Bytes of equal weight lie together, which compresses better."""
+        head = json.dumps({"steps": self.steps, "blobs": [[b.dtype.str, b.size] for b in self.blobs]}).encode()
+        body = b"".join(b.view(np.uint8).reshape(b.size, -1).T.tobytes() for b in self.blobs)
+        return zlib.compress(len(head).to_bytes(4, "little") + head + body, 9)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Record:
+        """From the bytes of `pack`."""
+        data = zlib.decompress(data)
+        at = 4 + int.from_bytes(data[:4], "little")
+        head = json.loads(data[4:at])
+        blobs = []
+        for kind, size in head["blobs"]:
+            dtype = np.dtype(kind)
+            planes = np.frombuffer(data, np.uint8, size * dtype.itemsize, at).reshape(dtype.itemsize, size)
+            blobs.append(np.ascontiguousarray(planes.T).reshape(-1).view(dtype))
+            at += size * dtype.itemsize
+        return cls(head["steps"], blobs)
+
+
+def load_record() -> Record:
+    """The record that the package ships."""
+    return Record.unpack(RECORD.read_bytes())
+
+
+def canonical(kernel: str, values: np.ndarray) -> np.ndarray:
+    """`values` with one pattern for all NaN, and zeros without a sign unless the kernel is one of `EXACT_ZEROS`."""
+    if values.dtype.kind != "f":
+        return values
+    values = values.copy() if kernel in EXACT_ZEROS else values + values.dtype.type(0)
+    values[np.isnan(values)] = np.nan
+    return values
+
+
+def checksum(kernel: str, values: np.ndarray) -> int:
+    """CRC-32 of the bits of `canonical` values."""
+    return zlib.crc32(np.ascontiguousarray(canonical(kernel, values)).view(np.uint8).reshape(-1).data)
 
 
 class WrongResult(Exception):
@@ -45,8 +117,7 @@ class Arrays:
 
     def output(self, step: list[Any], place: int) -> np.ndarray:
         """The array that is the argument `place` of a launch, as it is now."""
-        values: np.ndarray = self.backend.read(self.held[step[3][place][0]])
-        return values
+        return self.backend.read(self.held[step[3][place][0]])
 
     def release(self) -> None:
         """Free what is left."""
@@ -102,14 +173,12 @@ def _explain(record: Record, number: int, place: int, got: np.ndarray) -> str:
 def _expected(record: Record, number: int, place: int, outputs: list[Any]) -> np.ndarray:
     blob = next(blob for at, _, blob in outputs if at == place)
     if blob is not None:
-        kept: np.ndarray = record.blobs[blob]
-        return kept
+        return record.blobs[blob]
     twins = Arrays(record, TwinBackend(MemoryBudget(1 << 40)))
     for step in record.steps[: number + 1]:
         if step[0] != "launch" or step[1] not in CODEC_KERNELS:
             twins.do(step)
-    values: np.ndarray = twins.output(record.steps[number], place)
-    return values
+    return twins.output(record.steps[number], place)
 
 
 def _shown(value: Any) -> str:

@@ -3,8 +3,6 @@
 Forms that are named are left out. Prints the name of each form and kernel before it is built, and the verdict as JSON at the end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import resource
@@ -16,13 +14,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, DeviceError
-from flexgs_edge.kernels.choose_device import DeviceInfo, list_devices, probed
-from flexgs_edge.kernels.form import Form, possible_forms, with_written_fma
-from flexgs_edge.kernels.launch_record import load_record
+from flexgs_edge.kernels.choose_device import DeviceInfo, Form, list_devices, possible_forms, probed, with_written_fma
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.self_test import first_words, verdict
-from flexgs_edge.kernels.tested import FORM, MARK
-from flexgs_edge.kernels.verdict import Verdict
+from flexgs_edge.kernels.self_test import first_words, load_record, verdict
+from flexgs_edge.kernels.tested import FORM, MARK, Verdict
 from flexgs_edge.memory.budget import MemoryBudget
 
 KERNEL = "blend_stats"

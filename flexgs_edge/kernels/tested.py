@@ -1,17 +1,28 @@
-"""Use a device only after it has passed the self-test: once, in a process of its own, with the verdict kept."""
+"""Open a backend. A device is used only after it has passed the self-test: once, in a process of its own.
+
+A run opens one by `counted_backend`, which counts its memory.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+import tempfile
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
-from flexgs_edge.kernels.verdict import CACHE_VARIABLE, Verdict, keep_verdict, kept_verdict, key_of
-from flexgs_edge.progress import LOG
+from flexgs_edge.kernels.backend import Backend, TwinBackend
+from flexgs_edge.kernels.choose_device import SELF_TEST, DeviceInfo, choose_device, list_devices
+from flexgs_edge.kernels.cl_sources import constants_header, kernel_dir
+from flexgs_edge.kernels.self_test import RECORD
+from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.memory.process import current_rss
+from flexgs_edge.progress import LOG, Stopwatch
 
 CHILD = [sys.executable, "-m", "flexgs_edge.kernels.self_test_child"]
 """The command that tests one device. A compiler that crashes ends that process, not ours."""
@@ -21,6 +32,70 @@ FORM = "form "  # Begins what such a line says when another form of the kernels 
 
 _known: dict[str, Verdict] = {}
 _warned: set[str] = set()
+CACHE_VARIABLE = "FLEXGS_CACHE_DIR"  # Environment variable with another folder for what we keep between runs
+_ABOUT = ("name", "platform", "driver", "opencl_c", "type", "native_width", "max_work_group", "local_bytes")
+RUNTIME_BYTES = 88 * 2**20
+"""Bound on what PoCL's runtime and its compiler take before our kernels are built. Once the device is open, it is known."""
+BUILD_BYTES = 24 * 2**20
+"""Bound on the bytes that building our kernels adds to the loaded compiler: docs/results/tuning.md#memory"""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the self-test said: `DeviceInfo.self_test`, `DeviceInfo.loop_steps` and `DeviceInfo.form`."""
+
+    self_test: str
+    loop_steps: int = 0
+    form: str = ""
+
+
+def cache_folder() -> Path:
+    """Where verdicts lie: `devices` in FLEXGS_CACHE_DIR, or in `flexgs-edge` of the user's cache folder."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named:
+        return Path(named) / "devices"
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(caches) / "flexgs-edge" / "devices"
+
+
+def key_of(info: DeviceInfo) -> str:
+    """A name for the device, its driver, our kernels and the self-test together; any change gives another one."""
+    digest = hashlib.sha256(json.dumps([getattr(info, name) for name in _ABOUT]).encode())
+    for text in (SELF_TEST, constants_header()):
+        digest.update(text.encode())
+    for file in sorted(kernel_dir().glob("*.cl*")):
+        digest.update(file.name.encode() + file.read_bytes())
+    digest.update(RECORD.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def kept_verdict(key: str) -> Verdict | None:
+    """The verdict of an earlier run; None if there is none, or if its file cannot be read."""
+    try:
+        found = json.loads((cache_folder() / f"{key}.json").read_text(encoding="utf-8"))
+        verdict = Verdict(found["self_test"], found["loop_steps"], found["form"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    sound = isinstance(verdict.self_test, str) and isinstance(verdict.form, str) and type(verdict.loop_steps) is int
+    return verdict if sound else None
+
+
+def keep_verdict(key: str, info: DeviceInfo, verdict: Verdict) -> str | None:
+    """Keep a verdict for later runs. Returns None, or why that was not possible."""
+    about: dict[str, Any] = {name: getattr(info, name) for name in _ABOUT}
+    folder = cache_folder()
+    temporary = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f"{key}.", dir=folder)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump({**asdict(verdict), **about}, file, indent=1)
+        os.replace(temporary, folder / f"{key}.json")
+    except OSError as error:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
+        return f"{folder}: {error.strerror or error}"
+    return None
 
 
 def with_verdict(info: DeviceInfo, anew: bool = False) -> DeviceInfo:
@@ -124,3 +199,31 @@ def _how(code: int) -> str:
         return f"signal {-code}, {signal.Signals(-code).name}"
     except ValueError:
         return f"signal {-code}"
+
+
+def open_backend(device: str | None, budget: MemoryBudget) -> Backend:
+    """Open the backend that `device` names.
+
+    `device`: `numpy` for the twins, else an OpenCL device as in `flexgs_edge.kernels.choose_device.choose_device`. We
+    never fall back from one to the other silently. `budget`: counts every array of the backend. Raises `DeviceError` if
+    the device does not exist, or failed its self-test.
+    """
+    if device == "numpy":
+        return TwinBackend(budget)
+    from flexgs_edge.kernels.opencl import OpenCLBackend
+
+    info, _ = choose_tested(device)
+    return OpenCLBackend(info, budget)
+
+
+def counted_backend(device: str | None, budget: MemoryBudget, clock: Stopwatch) -> Backend:
+    """Open the backend that `device` names, as the stage `device`, and take its runtime's memory from the budget."""
+    budget.require("the program", 0)  # whose size is known by now
+    before = current_rss()
+    with clock.stage("device"):
+        backend = open_backend(device, budget)
+    if not backend.is_numpy and not budget.runtime:
+        # The runtime and its compiler stay loaded. They take more memory when no kernels are cached.
+        budget.runtime = max(current_rss() - before, 0) + BUILD_BYTES
+        budget.take("the OpenCL runtime", budget.runtime)
+    return backend

@@ -1,7 +1,5 @@
 """Memory of this process as the system reports it: held now, at its peak, and still available."""
 
-from __future__ import annotations
-
 import ctypes
 import resource
 import sys

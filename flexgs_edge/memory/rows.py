@@ -71,8 +71,7 @@ def _buffer() -> memoryview:
                 pages.madvise(mmap.MADV_HUGEPAGE)
         first = -np.frombuffer(pages, np.uint8).ctypes.data % BUFFER_BYTES
         _HELD.buffer = memoryview(pages)[first : first + BUFFER_BYTES]
-    held: memoryview = _HELD.buffer
-    return held
+    return _HELD.buffer
 
 
 def is_cached(address: int, size: int) -> bool:

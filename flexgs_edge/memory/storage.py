@@ -1,8 +1,5 @@
 """Where large arrays live: in memory, or in mapped scratch files whose pages the kernel can drop when it needs room."""
 
-from __future__ import annotations
-
-import errno
 import math
 import mmap
 import os
@@ -14,7 +11,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.errors import DISK_FULL, BudgetError, InputError
 from flexgs_edge.memory.process import AnonymousPeak
 from flexgs_edge.memory.rows import (
     COPY_ROWS,
@@ -34,7 +31,6 @@ WHOLE_BYTES = 1 << 26
 """Least size of a plane, in bytes, that may be read as a whole to take rows in any order. Otherwise each row would be a
 read of its own: docs/results/tuning.md#disks"""
 WHOLE_SHARE = 16  # Such a plane may be as large as this part of the limit (one in 16), if that is more
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _IN_MEMORY = {"tmpfs", "ramfs", "devtmpfs"}
 
 
@@ -127,11 +123,9 @@ class ScratchStorage(Storage):
 
     @property
     def peak_anonymous(self) -> int | None:
-        """See `Storage.peak_anonymous`."""
         return None if self._watch is None else self._watch.peak
 
     def close(self) -> None:
-        """See `Storage.close`."""
         if self._watch is not None:
             self._watch.close()
 
@@ -159,13 +153,12 @@ class ScratchStorage(Storage):
         return values
 
     def count(self, size: int) -> None:
-        """See `Storage.count`."""
         self.used += size
         self.peak = max(self.peak, self.used)
 
     def full(self, size: int, error: OSError) -> Exception:
         """The error to raise if a scratch file cannot grow by `size` bytes."""
-        if error.errno not in _FULL:
+        if error.errno not in DISK_FULL:
             return InputError(f"{self.folder}: cannot make a scratch file of {size} bytes ({error.strerror})")
         with suppress(OSError):
             status = os.statvfs(self.folder)

@@ -18,8 +18,7 @@ import numpy as np
 
 from flexgs_edge.constants import GROUP_ROWS
 from flexgs_edge.errors import InputError
-from flexgs_edge.packed.bitpack import pack_into, plane_bytes, unpack
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec, pack_into, plane_bytes, unpack
 from flexgs_edge.scene.contraction import LARGEST, Contraction, densest
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
@@ -52,8 +51,7 @@ def group_count(rows: int, groups: int | None = None) -> int:
 def group_bounds(rows: int, groups: int, first: int = 0, last: int | None = None) -> np.ndarray:
     """First rows of groups `first` to `last` (inclusive; `groups` stands for the end): i * rows // groups as i64."""
     index = np.arange(first, (groups if last is None else last) + 1, dtype=np.int64)
-    bounds: np.ndarray = index * rows // max(groups, 1)
-    return bounds
+    return index * rows // max(groups, 1)
 
 
 def group_of(row: int, rows: int, groups: int) -> int:
@@ -63,10 +61,7 @@ def group_of(row: int, rows: int, groups: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class QuantizedArray:
-    """The bit-packed codes of one field, and the range of each group.
-
-    `low`, `step`: [channels, G] f32.
-    """
+    """The bit-packed codes of one field, and the range of each group. `low`, `step`: [channels, G] f32."""
 
     bits: int  # bits per code, 1 to 16
     count: int  # rows
@@ -90,10 +85,7 @@ class QuantizedArray:
 
 @dataclass(frozen=True, eq=False)
 class QuantizedScene:
-    """A quantized scene; rows [0, sh_count) have SH, the others have none.
-
-    `count`, `sh_count`: rows, and rows with SH.
-    """
+    """A quantized scene; rows [0, sh_count) have SH, the others have none. `count`, `sh_count`: rows, and rows with SH."""
 
     count: int
     sh_count: int
@@ -128,27 +120,11 @@ def quantized_bytes(count: int, sh_count: int, sh_degree: int, bits: BitSpec, gr
     return total
 
 
-def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
-    """[c, n] u16, the codes of `rows` (a slice with step 1)."""
-    start, stop, _ = rows.indices(array.count)
-    out = np.empty((array.channels, max(stop - start, 0)), np.uint16)
-    for channel in range(array.channels):
-        out[channel] = unpack(array.planes[channel], array.bits, start, stop)
-    return out
-
-
-def dequantize(array: QuantizedArray, rows: slice) -> np.ndarray:
+def dequantize(array: QuantizedArray, rows: slice, first: int = 0, out: np.ndarray | None = None) -> np.ndarray:
     """Values of `rows` (a slice with step 1); this is the specification of every dequantizer.
 
-    Returns [c, n] f32, lo + code * step: first the product is rounded to float32, then the sum.
-    """
-    return dequantize_part(array, 0, rows)
-
-
-def dequantize_part(array: QuantizedArray, first: int, rows: slice, out: np.ndarray | None = None) -> np.ndarray:
-    """`dequantize` for an array whose planes start at row `first` (a multiple of 8); the ranges cover all rows.
-
-    Fills `out` ([c, n] f32) if it is given.
+    `first`: the row at which the planes of the array start, a multiple of 8; its ranges cover all rows. Fills `out` if it is
+    given. Returns [c, n] f32, lo + code * step: first the product is rounded to float32, then the sum.
     """
     start, stop, _ = rows.indices(array.count)
     if out is None:

@@ -1,7 +1,5 @@
 """LPIPS, the perceptual distance of Zhang et al. (CVPR 2018). The package `lpips` is loaded only if it is asked for."""
 
-from __future__ import annotations
-
 import pickle
 import warnings
 from pathlib import Path

@@ -15,7 +15,7 @@ import numpy as np
 
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.quality.psnr import drop, mean_psnr, modelled_drop, mse, mse_later, psnr
-from flexgs_edge.quality.ssim import modelled_ssim_drop
+from flexgs_edge.quality.similarity import modelled_ssim_drop
 
 Distance = Callable[[np.ndarray, np.ndarray], float | None]
 """Distance of two [H, W, 3] images; `None` if it is not defined for them."""
@@ -159,11 +159,6 @@ class Quality:
         known = [(weight, value) for weight, value in found if value is not None]
         total = math.fsum(weight for weight, _ in known)
         return math.fsum(weight * value for weight, value in known) / total if known else None
-
-    @property
-    def deciding_error(self) -> float:
-        """The mean squared error that decides: `covered_error` or `error`."""
-        return self.covered_error if self.covered_decides else self.error
 
     @property
     def covered_modelled_drop(self) -> float:

@@ -5,8 +5,6 @@ next. Their splats wait in a scratch file: 76 bytes a splat, where reading a row
 Reading again would also cost that much for every row that the view does not show.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,8 +18,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import CULLED, JACOBIAN_MARGIN, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.render.chunk_bounds import ChunkBounds
-from flexgs_edge.render.chunks import ViewPart
+from flexgs_edge.render.chunks import ChunkBounds, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import chunk_shapes, shapes_bytes
 from flexgs_edge.render.view_buffers import ViewBuffers
@@ -79,7 +76,6 @@ class ShownView:
         self._rows: list[np.ndarray] = []
 
     def put(self, splats: Splats) -> bool:
-        """See `CompactView.put`."""
         at, buffers = self.count, self._buffers
         records, keys, bounds, rows = splats
         assert buffers.rows is not None
@@ -126,10 +122,7 @@ def fill_compact(backend: Backend, scene: DeviceScene, buffers: ViewBuffers, vie
 
 
 class WaitingView:
-    """A compact view that is projected already and waits for its turn; its splats lie in a scratch file.
-
-    Close it when done.
-    """
+    """A compact view that is projected already and waits for its turn; its splats lie in a scratch file. Close it when done."""
 
     def __init__(self, backend: Backend, storage: Storage, camera: Camera, record: np.ndarray) -> None:
         self.of = camera

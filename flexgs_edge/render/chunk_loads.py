@@ -1,7 +1,5 @@
 """Load the chunks of a streamed scene in another thread, while the chunks before them are drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -78,16 +76,13 @@ class ChunkLoads:
         self._held, self._free, self._coming = [], [], {}
 
     def _ask(self, span: Span, ahead: bool = False) -> bool:
-        """Start to load a chunk.
-
-        One that is asked for ahead leaves a slot free for a chunk that must come before it.
-        """
+        """Start to load a chunk. One that is asked for ahead leaves a slot free for a chunk that must come before it."""
         start, stop, _ = span
         done: Callable[[], None] = _nothing
         stays = self._may_stay(stop - start)
         if stays:
             arrays = self._made(span)
-        elif ahead and self._coming_slots() >= max(self._slots, SLOTS) - 1:
+        elif ahead and sum(not loading.stays for loading in self._coming.values()) >= max(self._slots, SLOTS) - 1:
             if self._slots != SLOTS or not self._may_add(stop - start):
                 return False
             arrays = self._slot(span)
@@ -107,9 +102,6 @@ class ChunkLoads:
 
         self._coming[start] = Loading(arrays, stays, self._loader.submit(load))
         return True
-
-    def _coming_slots(self) -> int:
-        return sum(not loading.stays for loading in self._coming.values())
 
     def _slot(self, span: Span) -> ChunkArrays:
         arrays = self._made(span)

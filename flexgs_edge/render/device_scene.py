@@ -1,9 +1,8 @@
 """A scene on the backend, in chunks: it stays there if it fits into the budget, else each view streams it anew."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,8 @@ from flexgs_edge.constants import LANES, ROW_BLOCK
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render import fit as fit_module
-from flexgs_edge.render.chunk_bounds import ChunkBounds
 from flexgs_edge.render.chunk_loads import ChunkLoads
-from flexgs_edge.render.chunks import Chunk, ChunkArrays, ChunkPlanes, SourcePlanes
+from flexgs_edge.render.chunks import Chunk, ChunkArrays, ChunkBounds, ChunkPlanes, SourcePlanes
 from flexgs_edge.render.fit import (
     AHEAD_SHARE,
     MOST_SUMS,
@@ -30,7 +28,7 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 
 
-class DeviceScene:
+class DeviceScene(AbstractContextManager["DeviceScene"]):
     """A scene on a backend. Iterate over `chunks()` for every view; close when done.
 
     The first view decides, from the memory that it leaves free, whether the scene stays on the backend or is streamed.
@@ -299,10 +297,7 @@ class DeviceScene:
             loads.close()
 
     def refresh(self, *fields: str) -> None:
-        """Read `sh_dc` or `sh_rest` again after the source's values changed.
-
-        Streamed chunks are read again in any case.
-        """
+        """Read `sh_dc` or `sh_rest` again after the source's values changed. Streamed chunks are read again in any case."""
         if not isinstance(self._planes, SourcePlanes):
             raise TypeError("only a scene with a source can be refreshed")
         self.changes += 1
@@ -321,9 +316,6 @@ class DeviceScene:
             self._budget.reclaimers.remove(self.give_way)
         self.drop_statistics()
         self._planes.close()
-
-    def __enter__(self) -> DeviceScene:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -3,8 +3,6 @@
 This is arithmetic only; nothing is allocated.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -96,7 +94,7 @@ class ViewSize:
 
 
 class SceneSize(Protocol):
-    """The rows and bytes of a scene on a backend, as this module needs them."""
+    """The rows and bytes of a scene on a backend, as this module needs them: see `DeviceScene`."""
 
     count: int
     sum_bytes: int
@@ -104,32 +102,25 @@ class SceneSize(Protocol):
     structure: bool
 
     @property
-    def later_bytes(self) -> int:
-        """Bytes that sums over views will take, and that are not taken yet."""
+    def later_bytes(self) -> int: ...
 
     @property
-    def shown_bytes(self) -> int:
-        """Bytes of one view's sums for each row that a compact view shows."""
+    def shown_bytes(self) -> int: ...
 
     @property
-    def whole_bytes(self) -> int:
-        """Bytes of all chunks when loaded."""
+    def whole_bytes(self) -> int: ...
 
     @property
-    def held_bytes(self) -> int:
-        """Bytes that the loaded chunks take now."""
+    def held_bytes(self) -> int: ...
 
     @property
-    def least_chunk_bytes(self) -> int:
-        """Bytes of the smallest chunk of the streamed scene."""
+    def least_chunk_bytes(self) -> int: ...
 
     @property
-    def compact_rows(self) -> int:
-        """Rows of a chunk once the scene's views are compact."""
+    def compact_rows(self) -> int: ...
 
     @property
-    def compact_chunk_bytes(self) -> int:
-        """Bytes of a chunk once the scene's views are compact."""
+    def compact_chunk_bytes(self) -> int: ...
 
 
 def plane_bytes(sh_degree: int) -> int:

@@ -3,18 +3,18 @@
 Long lists are split into depth-ordered batches.
 """
 
-from __future__ import annotations
-
+import math
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import DEFAULT_NEAR
+from flexgs_edge.constants import DEFAULT_NEAR, DILATION, ROW_SPAN
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.kernels.backend import Backend, window
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.storage import IN_MEMORY, Storage
 from flexgs_edge.packed.quantize import QuantizedScene
@@ -23,10 +23,8 @@ from flexgs_edge.render.ahead import ViewsAhead, camera_record
 from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, GROWTH, GUESS, MOST_SUMS, SUM_BYTES, Fit, fits_whole, saves_bytes
-from flexgs_edge.render.residual import add_structure, target_residual
 from flexgs_edge.render.statistics import Statistics, SumReader
-from flexgs_edge.render.tile_lists import list_tiles, sort_splats, split_batches
-from flexgs_edge.render.view_buffers import ViewBuffers, view_key, view_size
+from flexgs_edge.render.view_buffers import ViewBuffers, list_tiles, sort_splats, split_batches, view_key, view_size
 from flexgs_edge.scene.source import SceneSource
 
 
@@ -41,7 +39,7 @@ class _View:
     parts: dict[int, ViewPart] | None  # The rows of each chunk, by the chunk's first row; None in a compact view
 
 
-class Renderer:
+class Renderer(AbstractContextManager["Renderer"]):
     """Renders views and sums what each Gaussian contributes, on a backend.
 
     `antialiased`: multiply opacities by sqrt(det before / det
@@ -52,7 +50,7 @@ class Renderer:
 
     def __init__(
         self,
-        backend: Backend,  # from `flexgs_edge.kernels.open_backend`
+        backend: Backend,  # from `flexgs_edge.kernels.backend`
         budget: MemoryBudget,
         near: float = DEFAULT_NEAR,  # near plane, scene units
         background: Sequence[float] = (0.0, 0.0, 0.0),  # red, green, blue in [0, 1]; black by default
@@ -142,10 +140,7 @@ class Renderer:
         return self.render_planes(scene, camera)[:, : camera.height, : camera.width].transpose(1, 2, 0)
 
     def in_turn(self, scene: DeviceScene, cameras: Sequence[Camera]) -> Iterator[Camera]:
-        """Yield each camera when its view is to be drawn.
-
-        A scene in scratch files is then read once for several views.
-        """
+        """Yield each camera when its view is to be drawn. A scene in scratch files is then read once for several views."""
         return self._ahead.in_turn(scene, cameras)
 
     def render_planes(self, scene: DeviceScene, camera: Camera) -> np.ndarray:
@@ -176,7 +171,7 @@ class Renderer:
         found = self.view_rows
         rows = slice(None) if found is None else found
         statistics.hits[rows] += self.backend.read(hits, np.empty(view.count, np.uint32))
-        statistics.weights[rows] += self._reader.planes(sums, view.count, 1)[0].view(np.uint64)
+        statistics.weights[rows] += self._reader.first_plane(sums, view.count)
 
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.
@@ -184,11 +179,7 @@ class Renderer:
         Returns [m, 2, 2] u32 for the rows of `parts` or `view_rows`, low and high words in units of 1 / `FIXED_ERROR`;
         valid until the next sums are drawn.
         """
-        view = self._prepare(scene, camera)
-        self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, view, 2)
-        self._blend(view, "blend_removal", (hits, sums), again=True)
-        return sums
+        return self._sums(scene, camera, 2, "blend_removal")
 
     def residual_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """Weights of each row in one view, and the weighted residual (`target` minus the view) at its pixels.
@@ -198,13 +189,7 @@ class Renderer:
         Returns [m, 4, 2] u32, low and high words of sum(alpha T) and sum(alpha T r) for red, green, blue, in units of 1
         / `FIXED_WEIGHT`; valid until the next sums are drawn.
         """
-        view = self._prepare(scene, camera)
-        self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, view, 4)
-        self._blend(
-            view, "blend_residual", (hits, sums, target_residual(self.backend, view.buffers, target)), again=True
-        )
-        return sums
+        return self._sums(scene, camera, 4, "blend_residual", target)
 
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """The sums of `residual_sums` and `removal_sums` in one view, cheaper than two calls.
@@ -212,12 +197,7 @@ class Renderer:
         Returns [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
         drawn.
         """
-        view = self._prepare(scene, camera)
-        self._blend(view, "blend")
-        hits, sums = self._sum_arrays(scene, view, 6)
-        residual = target_residual(self.backend, view.buffers, target)
-        self._blend(view, "blend_both", (hits, sums, residual), again=True)
-        return sums
+        return self._sums(scene, camera, 6, "blend_both", target)
 
     def gradient_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray, structure: float = 0.0) -> Any:
         """Gradients of the loss of one view against `target`, for each splat, summed over pixels.
@@ -240,15 +220,16 @@ class Renderer:
         self._blend(view, "blend_backward", (hits, sums, residual), again=True)
         return sums
 
-    def read_sums(self, sums: Any, channels: int, count: int, first: int = 0) -> np.ndarray:
-        """[channels, count] i64, planes of the last view's sums from plane `first` on, for all rows of the scene."""
-        assert self._drawn is not None
-        values, rows = self._reader.planes(sums, self._drawn.count, channels, first), self.view_rows
-        if rows is None:
-            return values
-        whole = np.zeros((channels, count), np.int64)
-        whole[:, rows] = values
-        return whole
+    def _sums(
+        self, scene: DeviceScene, camera: Camera, channels: int, blend: str, target: np.ndarray | None = None
+    ) -> Any:
+        """Draw a view, then its sums by `blend`, against a target if there is one."""
+        view = self._prepare(scene, camera)
+        self._blend(view, "blend")
+        extra = self._sum_arrays(scene, view, channels)
+        residual = () if target is None else (target_residual(self.backend, view.buffers, target),)
+        self._blend(view, blend, (*extra, *residual), again=True)
+        return extra[1]
 
     def _sum_arrays(self, scene: DeviceScene, view: _View, channels: int) -> tuple[Any, Any]:
         held, count = scene.statistics, view.buffers.rows or scene.count
@@ -382,8 +363,43 @@ class Renderer:
         self.release()
         self.backend.close()
 
-    def __enter__(self) -> Renderer:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
+    """What the drawn view lacks of `target` ([3, H, W] f16, laid out as by `Renderer.render_planes`).
+
+    The result is an array of the backend, [3 H W] f32: `target` - view.
+    The target must not change afterwards, since the device may read it later.
+    """
+    half, residual = buffers.reference_arrays()
+    backend.write(half, target.reshape(-1), stays=True)
+    backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
+    return residual
+
+
+def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight: float) -> None:
+    """Add minus half the gradient of `weight` times the sum of 1 - SSIM, over windows and channels, to the residual.
+
+    SSIM is that of the drawn view and its target, both clamped to [0, 1], by windows inside the picture. The windows of
+    a sampled view (`Camera.every`) cover as much of the picture as those of a whole view. A view with a side below the
+    window's has no term.
+    """
+    weights = window(round(math.sqrt(DILATION / camera.dilation)))
+    size = len(weights)
+    if min(camera.width, camera.height) < size:
+        return
+    taps, slopes = buffers.structure_arrays(weights)
+    target, residual = buffers.reference_arrays()
+    _, rows, stride = buffers.image.shape
+    across, plane, wide = -(-stride // ROW_SPAN) * ROW_SPAN, rows * stride, slopes.shape[2]
+    windows, columns = (side - size + 1 for side in (camera.height, camera.width))
+    backend.launch(
+        "dssim_slopes", (3 * windows * across,), across, windows, columns, stride, plane, wide, size, taps, buffers.image,
+        target, slopes,
+    )  # fmt: skip
+    backend.launch(
+        "dssim_residual", (3 * camera.height * across,), across, camera.height, stride, plane, wide, weight / 2, size, taps,
+        slopes, buffers.image, target, residual,
+    )  # fmt: skip

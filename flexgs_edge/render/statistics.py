@@ -63,9 +63,9 @@ class SumReader:
         self._words = np.empty(0, np.uint32)
         """Kept from view to view: fresh pages for each one take as long as the copy."""
 
-    def planes(self, sums: Any, count: int, channels: int, first: int = 0) -> np.ndarray:
-        """Planes of the first `count` rows of `sums` ([., planes, 2] u32), from plane `first` on: [channels, count] i64."""
-        planes, values = sums.shape[1], np.empty((channels, count), np.int64)
+    def first_plane(self, sums: Any, count: int) -> np.ndarray:
+        """[count] u64, the first plane of the first `count` rows of `sums` ([., planes, 2] u32)."""
+        planes, values = sums.shape[1], np.empty(count, np.uint64)
         size = min(SUM_ROWS, count) * planes * 2
         if self._words.size < size:
             self._words = np.empty(size, np.uint32)
@@ -73,7 +73,7 @@ class SumReader:
             rows = min(SUM_ROWS, count - base)
             words = self._words[: rows * planes * 2].reshape(rows, planes, 2)
             self._backend.read(sums, words, 2 * planes * base)
-            values[:, base : base + rows] = words.view(np.int64)[:, first : first + channels, 0].T
+            values[base : base + rows] = words.view(np.uint64)[:, 0, 0]
         return values
 
     def release(self) -> None:

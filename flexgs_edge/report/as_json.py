@@ -1,7 +1,5 @@
 """Write results as JSON. Figures are rounded to the digits that matter; null stands for a missing figure."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from flexgs_edge.codec.header import Section
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
+from flexgs_edge.codec.sections import Section
+from flexgs_edge.report.run_info import Result, RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import line, run_lines, scene_lines, text, view_lines
 from flexgs_edge.units import format_mib, format_size, times_words
 
@@ -62,7 +62,7 @@ class ConversionLoss:
 
 
 @dataclass(frozen=True)
-class DecompressResult:
+class DecompressResult(Result):
     """Result of `decompress`: the file it wrote, and for other programs' formats what they lost."""
 
     scene: SceneInfo
@@ -74,12 +74,10 @@ class DecompressResult:
     warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         ratio = self.scene.ratio_of(self.size)
         return record("decompress", self, ratio_of_input=None if ratio is None else round(ratio, 4))
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = scene_lines("scene", self.scene)
         lines.append(line("wrote", f"{self.output}, {self.size} bytes ({format_size(self.size)})"))
         if self.scene.bytes is not None:
@@ -93,7 +91,7 @@ class DecompressResult:
 
 
 @dataclass(frozen=True)
-class RenderResult:
+class RenderResult(Result):
     """Result of `render`: the files and the time of each view. `run` holds the times of start-up and kernel compilation."""
 
     scene: SceneInfo
@@ -110,7 +108,6 @@ class RenderResult:
         return 1000 * (times[(len(times) - 1) // 2] + times[len(times) // 2]) / 2 if times else 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         run = self.run.to_json()
         return record(
             "render",
@@ -125,7 +122,6 @@ class RenderResult:
         )
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         first = self.files[0] if self.files else "no files"
         last = f" ... {self.files[-1]}" if len(self.files) > 1 else ""
@@ -142,7 +138,7 @@ class RenderResult:
 
 
 @dataclass(frozen=True)
-class VerifyResult:
+class VerifyResult(Result):
     """Result of `verify`: the parts of a file and their verdicts."""
 
     path: str  # the file
@@ -159,11 +155,9 @@ class VerifyResult:
         return tuple(section.name for section in self.sections if not section.ok)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return record("verify", self, ok=self.ok)
 
     def summary(self) -> str:
-        """Return the text that the command prints: one line per part."""
         parts, bad = self.sections, len(self.damaged)
         lines = [f"{s.name:<12} {s.length:>12} bytes at {s.offset:>12}  {'ok' if s.ok else 'DAMAGED'}" for s in parts]
         verdict = f"{bad} of {len(parts)} parts DAMAGED" if bad else "every checksum holds"
@@ -172,7 +166,7 @@ class VerifyResult:
 
 
 @dataclass(frozen=True)
-class TrimResult:
+class TrimResult(Result):
     """Result of `trim`: layers, Gaussians and bytes before and after the cut; whether the new file is the preview of the old."""
 
     input: str
@@ -187,11 +181,9 @@ class TrimResult:
     is_preview: bool = False
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return record("trim", self)
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = [
             f"{self.input}: {self.input_size} bytes ({format_size(self.input_size)}), "
             f"{self.input_count} Gaussians in {self.input_layers} layers",
@@ -204,7 +196,7 @@ class TrimResult:
 
 
 @dataclass(frozen=True)
-class ViewResult:
+class ViewResult(Result):
     """Result of `view`: the scene that was shown, and where.
 
     `size`, `views`: bytes of the `.fgs` that was shown, and cameras to choose from.
@@ -217,11 +209,9 @@ class ViewResult:
     page_size: int | None  # bytes of the page that was written
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return record("view", self, "place", **{"output" if self.page_size is not None else "address": self.place})
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = scene_lines("scene", self.scene)
         lines.append(line("shown", f"{self.size} bytes ({format_size(self.size)}), {self.views} cameras"))
         if self.page_size is None:
@@ -232,7 +222,7 @@ class ViewResult:
 
 
 @dataclass(frozen=True)
-class DevicesResult:
+class DevicesResult(Result):
     """Result of `devices`: the OpenCL devices, and the chosen one."""
 
     devices: tuple[DeviceInfo, ...]  # limits and self-test verdict of each device
@@ -240,11 +230,9 @@ class DevicesResult:
     reason: str  # why this device was chosen, or why none was
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return {"devices": [info.to_json() for info in self.devices], "chosen": self.chosen, "reason": self.reason}
 
     def summary(self) -> str:
-        """Return the text that the command prints: a few lines per device."""
         lines = [line for info in self.devices for line in _device_lines(info)]
         if self.chosen is not None:
             lines.append(f"chosen: [{self.chosen}] ({self.reason})")

@@ -1,18 +1,16 @@
 """Result of `info`, as values, as JSON and as text."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flexgs_edge.report.run_info import record
+from flexgs_edge.report.run_info import Result, record
 from flexgs_edge.report.summary import aligned
 from flexgs_edge.units import format_size
 
 
 @dataclass(frozen=True)
-class InfoResult:
+class InfoResult(Result):
     """Contents of a scene file.
 
     `count`, `sh_count`, `sh_degree`: Gaussians, those that may have SH above degree 0, and the SH degree. `cameras`,
@@ -64,7 +62,6 @@ class InfoResult:
         return self.size - sum(int(channel["bytes"]) for channel in self.channels.values()) - preview
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         of_other = ("cameras", "images", "antialiased", "format_version", "frame", "bounds")
         of_version_2 = ("chroma", "model_bytes", "layers", "preview", "cut_from")
         if self.version is None:
@@ -74,7 +71,6 @@ class InfoResult:
         return record("info", self, *left_out, **derived)
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         number = self.format_version if self.version is None else self.version
         version = "" if number is None else f" version {number}"
         lines = [f"{self.path}: {self.format}{version}, {self.size} bytes ({format_size(self.size)})"]

@@ -47,10 +47,7 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one kind. Points whose y is None are left out.
-
-    `x`, `y`: coordinates of the points.
-    """
+    """Points of one kind. Points whose y is None are left out. `x`, `y`: coordinates of the points."""
 
     label: str  # name in the legend
     x: Sequence[float]
@@ -91,7 +88,69 @@ class LineChart(Chart):
     front: Sequence[tuple[float, float]] = ()
 
     def draw(self, axes: Axes) -> None:
-        _lines(axes, self)
+        from matplotlib.patheffects import withStroke
+        from matplotlib.ticker import LogLocator, NullLocator
+
+        xs = [x for series in self.series for x in series.x]
+        scale = math.log2 if self.doublings or self.log_x else float
+        middle = (scale(min(xs)) + scale(max(xs))) / 2
+        for place, series in enumerate(self.series):
+            colour, mark = COLOURS[place], MARKS[place]
+            points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
+            axes.plot(
+                [x for x, _, _ in points],
+                [y for _, y, _ in points],
+                linestyle="-" if series.line else "",
+                linewidth=1.5,
+                label=series.label,
+                color=colour,
+                marker=mark,
+                markersize=5,
+                zorder=3,
+                clip_on=False,  # show marks at zero whole
+            )
+            for broken in series.broken:
+                _cross(axes, broken, next((y for x, y, _ in points if x == broken), None), colour)
+            for x, y, i in points:
+                if series.notes:
+                    words = series.notes[i]
+                    # Long notes extend towards the middle, so that they stay inside the chart. All have a white outline.
+                    side = "center" if len(words) < SHORT else "right" if scale(x) > middle else "left"
+                    note = axes.annotate(
+                        words, (x, y), (0, 6), textcoords="offset points", fontsize=8, ha=side, zorder=5
+                    )
+                    note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+        if self.limit is not None:
+            axes.axhline(self.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+            axes.annotate(
+                f"{self.limit:g} dB", (1, self.limit), (-2, 2), ("axes fraction", "data"), "offset points", ha="right"
+            )
+        if self.doublings:
+            axes.set_xscale("log", base=2)
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
+        if self.log_x:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+            axes.xaxis.set_minor_locator(NullLocator())
+        if self.front:
+            steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
+            axes.step(*coordinates(sorted(self.front)), where="post", label="Pareto front", **steps)
+        # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
+        shown = [y for series in self.series for y in series.y if y is not None]
+        low, high = min(shown, default=0.0), max(shown, default=1.0)
+        if self.limit is not None:
+            high = max(high, self.limit)  # a mark outside the axes would shrink them
+        if self.magnitudes:
+            axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
+            axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
+            axes.yaxis.set_minor_locator(NullLocator())
+        if not self.floating:
+            axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if self.magnitudes else 1.1))
+        axes.set_xlabel(self.x_label)
+        axes.set_ylabel(self.y_label + (", log above 0.1" if self.magnitudes else ""))
+        if any(series.label for series in self.series):
+            axes.legend()
 
 
 @dataclass(frozen=True)
@@ -105,7 +164,21 @@ class BarChart(Chart):
     limit: float | None = None  # mark this level with a line, and bars above it with a cross
 
     def draw(self, axes: Axes) -> None:
-        _bars(axes, self)
+        width = 0.8 / len(self.bars)
+        for number, (label, values) in enumerate(self.bars.items()):
+            left = [group - 0.4 + (number + 0.5) * width for group in range(len(self.groups))]
+            shown = [value or 0.0 for value in values]
+            bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
+            axes.bar_label(bars, [_bar_words(value, self) for value in values], padding=2, fontsize=7.5, color=INK)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        if self.limit is not None:
+            axes.axhline(self.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        axes.set_xticks(range(len(self.groups)), self.groups)
+        axes.grid(axis="x", visible=False)
+        axes.margins(y=0.12)
+        axes.set_ylabel(self.y_label)
+        if len(self.bars) > 1:
+            axes.legend()
 
 
 def require_matplotlib() -> None:
@@ -141,94 +214,12 @@ def draw(chart: Chart) -> Figure:
     return figure
 
 
-def _lines(axes: Axes, chart: LineChart) -> None:
-    from matplotlib.patheffects import withStroke
-    from matplotlib.ticker import LogLocator, NullLocator
-
-    xs = [x for series in chart.series for x in series.x]
-    scale = math.log2 if chart.doublings or chart.log_x else float
-    middle = (scale(min(xs)) + scale(max(xs))) / 2
-    for place, series in enumerate(chart.series):
-        colour, mark = COLOURS[place], MARKS[place]
-        points = [(x, y, i) for i, (x, y) in enumerate(zip(series.x, series.y)) if y is not None]
-        axes.plot(
-            [x for x, _, _ in points],
-            [y for _, y, _ in points],
-            linestyle="-" if series.line else "",
-            linewidth=1.5,
-            label=series.label,
-            color=colour,
-            marker=mark,
-            markersize=5,
-            zorder=3,
-            clip_on=False,  # show marks at zero whole
-        )
-        for broken in series.broken:
-            _cross(axes, broken, next((y for x, y, _ in points if x == broken), None), colour)
-        for x, y, i in points:
-            if series.notes:
-                words = series.notes[i]
-                # Long notes extend towards the middle, so that they stay inside the chart. All have a white outline.
-                side = "center" if len(words) < SHORT else "right" if scale(x) > middle else "left"
-                note = axes.annotate(words, (x, y), (0, 6), textcoords="offset points", fontsize=8, ha=side, zorder=5)
-                note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
-    if chart.limit is not None:
-        axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-        axes.annotate(
-            f"{chart.limit:g} dB", (1, chart.limit), (-2, 2), ("axes fraction", "data"), "offset points", ha="right"
-        )
-    if chart.doublings:
-        axes.set_xscale("log", base=2)
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}x")
-    if chart.log_x:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-        axes.xaxis.set_minor_locator(NullLocator())
-    if chart.front:
-        steps: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (2, 2)), "zorder": 1}
-        axes.step(*coordinates(sorted(chart.front)), where="post", label="Pareto front", **steps)
-    # Axes of losses start at zero, or below if compression helped, so that small losses do not look large.
-    shown = [y for series in chart.series for y in series.y if y is not None]
-    low, high = min(shown, default=0.0), max(shown, default=1.0)
-    if chart.limit is not None:
-        high = max(high, chart.limit)  # a mark outside the axes would shrink them
-    if chart.magnitudes:
-        axes.set_yscale("symlog", linthresh=LINEAR_BELOW, linscale=0.4)
-        axes.set_yticks((0.0, *LEVELS), [f"{level:g}" for level in (0.0, *LEVELS)], minor=False)
-        axes.yaxis.set_minor_locator(NullLocator())
-    if not chart.floating:
-        axes.set_ylim(min(low * 1.1, 0.0), max(high, LINEAR_BELOW) * (1.4 if chart.magnitudes else 1.1))
-    axes.set_xlabel(chart.x_label)
-    axes.set_ylabel(chart.y_label + (", log above 0.1" if chart.magnitudes else ""))
-    if any(series.label for series in chart.series):
-        axes.legend()
-
-
 def _cross(axes: Axes, x: float, y: float | None, colour: str) -> None:
     cross: dict[str, Any] = {"color": colour, "markersize": 13, "markeredgewidth": 2.2, "clip_on": False, "zorder": 6}
     if y is None:
         axes.plot([x], [0.98], "x", transform=axes.get_xaxis_transform(), **cross)
     else:
         axes.plot([x], [y], "x", **cross)
-
-
-def _bars(axes: Axes, chart: BarChart) -> None:
-    width = 0.8 / len(chart.bars)
-    for number, (label, values) in enumerate(chart.bars.items()):
-        left = [group - 0.4 + (number + 0.5) * width for group in range(len(chart.groups))]
-        shown = [value or 0.0 for value in values]
-        bars = axes.bar(left, shown, width * 0.94, color=COLOURS[number], label=label)
-        axes.bar_label(bars, [_bar_words(value, chart) for value in values], padding=2, fontsize=7.5, color=INK)
-    axes.axhline(0.0, color=INK, linewidth=0.8)
-    if chart.limit is not None:
-        axes.axhline(chart.limit, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.set_xticks(range(len(chart.groups)), chart.groups)
-    axes.grid(axis="x", visible=False)
-    axes.margins(y=0.12)
-    axes.set_ylabel(chart.y_label)
-    if len(chart.bars) > 1:
-        axes.legend()
 
 
 def _bar_words(value: float | None, chart: BarChart) -> str:

@@ -1,11 +1,9 @@
-"""Results of `compress` and `evaluate`, the commands that measure quality.
+"""Results of `compress`, of one scene or several, and of `evaluate`: the commands that measure quality.
 
 The JSON keys are the field names below, unless a docstring says otherwise. Sizes are bytes and quality is dB. Times are
 seconds, or milliseconds if the name ends in `_ms`. null means "identical" for PSNR and fidelity, and "not measured" for photos
 and targets.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ from flexgs_edge.goals.promise import KeptPromise
 from flexgs_edge.goals.steps import Scored, SearchResult
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.report.as_json import promise_json, quality_json, rounded, step_json
-from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo, record
+from flexgs_edge.report.run_info import RemovedGroup, Result, RunInfo, SceneInfo, ViewsInfo, record
 from flexgs_edge.report.summary import (
     aligned,
     decibel,
@@ -30,9 +28,12 @@ from flexgs_edge.report.summary import (
 )
 from flexgs_edge.units import format_size
 
+_FAULT, _FAILED = 1, 2
+_HEADINGS = ("input", "output", "as .ply", "file", "ratio", "quality", "time")
+
 
 @dataclass(frozen=True)
-class CompressResult:
+class CompressResult(Result):
     """Result of `compress`.
 
     `scene`, `views`: the input scene, and the views; `views` is `None` for a run without cameras. `count`, `sh_count`:
@@ -72,6 +73,7 @@ class CompressResult:
     warnings: tuple[str, ...] = ()  # Reasons to trust the figures less. Each names a number and what to do.
     # How the bounds beside the target stand on the deciding views; `None` without such bounds.
     promise: KeptPromise | None = None
+    removed: tuple[RemovedGroup, ...] = ()  # the kinds of Gaussians that `--clean` found
     preview_bytes: int = 0  # bytes of the file that are its preview (`best`); 0 if it has none
 
     @property
@@ -90,7 +92,6 @@ class CompressResult:
         return self.scene.ply_bytes_without_normals / self.size
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return record(
             "compress",
             self,
@@ -104,7 +105,6 @@ class CompressResult:
         )
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *view_lines(self.views)]
         size = f"{self.size} bytes ({format_size(self.size)})"
         if self.output is None:
@@ -172,7 +172,7 @@ def decided_words(result: CompressResult) -> str:
 
 
 @dataclass(frozen=True)
-class EvaluateResult:
+class EvaluateResult(Result):
     """Result of `evaluate`: the quality of a scene against its original, over `quality_views`."""
 
     scene: SceneInfo
@@ -184,11 +184,9 @@ class EvaluateResult:
     warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the record as JSON values."""
         return record("evaluate", self, quality=quality_json(self.quality))
 
     def summary(self) -> str:
-        """Return the text that the command prints."""
         lines = [*scene_lines("scene", self.scene), *scene_lines("against", self.reference), *view_lines(self.views)]
         lines += quality_lines(self.quality, f"{len(self.quality.views)} {self.quality_views} views")
         lines += [line("warning", words) for words in self.warnings]
@@ -222,3 +220,111 @@ def _view_table(views: Sequence[ViewQuality]) -> list[str]:
         columns += [figure("LPIPS to ref.", "lpips_original"), figure("LPIPS", "lpips_photo")]
         columns.append(figure("of original", "original_lpips"))
     return aligned([[head for head, _ in columns], *([cell(view) for _, cell in columns] for view in views)])
+
+
+@dataclass(frozen=True)
+class BatchItem:
+    """One scene of several."""
+
+    input: str  # the scene, as given or as found in a folder
+    result: CompressResult | None  # `None` if the scene failed
+    error: str | None = None  # why it failed
+    exit_code: int = 0  # what `compress` of this scene alone would have ended with
+
+    @property
+    def reason(self) -> str:
+        """The error without the name of the scene in front."""
+        return (self.error or "").removeprefix(f"{self.input}: ")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record of `compress`, or the error, as JSON values."""
+        if self.result is not None:
+            return self.result.to_json()
+        return {"input": {"path": self.input}, "error": self.error, "exit_code": self.exit_code}
+
+
+@dataclass(frozen=True)
+class BatchResult(Result):
+    """Result of `compress_all`."""
+
+    items: tuple[BatchItem, ...]  # the scenes that are done or failed, in the order of the inputs
+    total: int  # Number of scenes. An interruption leaves more of them than `items`.
+    seconds: float  # wall seconds of all
+
+    @property
+    def results(self) -> tuple[CompressResult, ...]:
+        """The results of the scenes that are done."""
+        return tuple(item.result for item in self.items if item.result is not None)
+
+    @property
+    def failed(self) -> tuple[BatchItem, ...]:
+        """The scenes that failed."""
+        return tuple(item for item in self.items if item.result is None)
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all are done, 2 if any failed, 1 if any failed by a fault of ours."""
+        codes = {item.exit_code for item in self.failed}
+        return _FAULT if _FAULT in codes else _FAILED if codes else 0
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Return the record of each scene as JSON values."""
+        return [item.to_json() for item in self.items]
+
+    def summary(self) -> str:
+        rows = [_HEADINGS] + [_row(item.result) for item in self.items if item.result is not None]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
+        widths[0] = max([widths[0], *(len(item.input) for item in self.items)])
+        lines = [_aligned(_HEADINGS, widths)] if self.results else []
+        for item in self.items:
+            if item.result is None:
+                lines.append(f"{item.input.ljust(widths[0])}  FAILED: {item.reason}")
+            else:
+                lines.append(_aligned(_row(item.result), widths))
+        return text([*lines, self._sums()])
+
+    def _sums(self) -> str:
+        results, left = self.results, self.total - len(self.items)
+        words = f"{len(results)} of {self.total} scenes done"
+        words += f", {len(self.failed)} failed" if self.failed else ""
+        words += f", {left} not begun or not finished" if left else ""
+        if results:
+            before, after = sum(each.scene.ply_bytes for each in results), sum(each.size for each in results)
+            words += f": {format_size(before)} -> {format_size(after)} ({before / after:.2f}x)"
+        words += f", {self.seconds:.1f} s"
+        dry = bool(results) and all(each.output is None for each in results)
+        return words + ("; nothing was written (--dry-run)" if dry else "")
+
+
+def _row(result: CompressResult) -> tuple[str, ...]:
+    return (
+        result.scene.path,
+        result.output or "-",
+        format_size(result.scene.ply_bytes),
+        format_size(result.size),
+        f"{result.ratio:.2f}x",
+        _quality(result),
+        f"{result.run.seconds:.1f} s",
+    )
+
+
+def _quality(result: CompressResult) -> str:
+    """The figure that decided, else the drop."""
+    quality = result.quality
+    if quality is None:
+        return "-"
+    missed = "" if result.reached in (True, None) else ", NOT reached"
+    if result.decided_by == "fidelity":
+        return f"fidelity {decibel(quality.fidelity)}{'' if quality.fidelity is None else ' dB'}{missed}"
+    if quality.drop is not None and result.decided_by != "modelled drop":
+        return f"drop {decibel(quality.usual_drop)} dB{missed}"
+    return f"modelled drop {quality.modelled_drop:.3f} dB{missed}"
+
+
+def _aligned(row: tuple[str, ...], widths: list[int]) -> str:
+    """Names to the left, numbers to the right."""
+    cells = [
+        cell.rjust(width) if 2 <= column <= 4 or column == 6 else cell.ljust(width)
+        for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+    ]
+    return "  ".join(cells).rstrip()

@@ -1,7 +1,6 @@
 """Records that every result holds: times and memory, the scene, the views."""
 
-from __future__ import annotations
-
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
@@ -32,6 +31,18 @@ def _value(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _value(one) for key, one in value.items()}
     return [_value(one) for one in value] if isinstance(value, (tuple, list)) else value
+
+
+class Result(ABC):
+    """What a command returns."""
+
+    @abstractmethod
+    def to_json(self) -> Any:
+        """Return the record as JSON values."""
+
+    @abstractmethod
+    def summary(self) -> str:
+        """Return the text that the command prints."""
 
 
 @dataclass(frozen=True)
@@ -106,3 +117,22 @@ class ViewsInfo:
     width: int
     height: int
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RemovedGroup:
+    """Gaussians of one kind that a cleaning found."""
+
+    kind: str
+    count: int
+    centre: tuple[float, float, float]  # median of their positions, world
+    gain: float  # dB that the views which report gain without them; below 0: what they lose
+    removed: bool = True  # False: they stay, since the views would lose
+
+    def __str__(self) -> str:
+        place = ", ".join(f"{value:.4g}" for value in self.centre)
+        verdict = "" if self.removed else ", so they stay"
+        change = (
+            "no view changes" if self.gain == 0 else f"{'gain' if self.gain > 0 else 'loss'} {abs(self.gain):.4f} dB"
+        )
+        return f"{self.count} {self.kind} (around {place}): {change}{verdict}"

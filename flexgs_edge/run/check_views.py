@@ -4,12 +4,9 @@ A picture that never matched its photo loses nothing by becoming grey. So a few 
 photos, and with those of their neighbours. Without photos the renders must show something.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -18,30 +15,28 @@ from flexgs_edge.cameras.conventions import other_conventions
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.progress import LOG
-from flexgs_edge.quality.likeness import SIDE, details, likeness
 from flexgs_edge.quality.psnr import mse, psnr
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.inputs import Options
-from flexgs_edge.run.options import AUTO_CAMERAS
 from flexgs_edge.run.quality_evaluator import work_bytes
 from flexgs_edge.run.run import Run
 from flexgs_edge.run.view_set import ViewSet
 
-RUNS, RUN = 5, 3
-"""Views are compared in at most so many runs, evenly spread, of so many neighbours in order of name."""
+RUNS, RUN = 5, 3  # Views are compared in at most so many runs, evenly spread, of so many neighbours in order of name
 ALIKE = 0.5
 """Least likeness of a render and its photo. Blurred, noisy and badly exposed photos have .6 and more, wrong ones .3 and less:
 docs/results/tuning.md#view_likeness"""
-SURE = 3.0
-"""Other photos fit better if they do so by this many standard errors of the mean difference."""
-MOST_SHIFT = 8
-"""Photos of cameras up to so many places away are tried where a view has the wrong one."""
+SURE = 3.0  # Other photos fit better if they do so by this many standard errors of the mean difference
+MOST_SHIFT = 8  # Photos of cameras up to so many places away are tried where a view has the wrong one
 TURN_VIEWS, TURN_ROWS = 4, 1 << 28
 """Other conventions are tried on at most so many views, and on fewer where these would draw more Gaussians than this."""
 
 _Pictures = list[np.ndarray]
-_T = TypeVar("_T")
+SIDE = 96  # Pixels of the longer side of the pictures that are compared
+FINE, COARSE = 1, 6  # Half sides of the windows of both scales, pixels
+PLAIN = 0.25 / 255.0
+"""A picture whose details have less than this root mean square shows nothing that could be compared."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ def check_views(run: Run[Options], renderer: Renderer, trusted: bool) -> Run[Opt
     show the scene; the message names the likely cause.
     """
     views = run.seen
-    if views.cameras_from == AUTO_CAMERAS:
+    if views.automatic:
         return run
     with run.clock.stage("check views"):
         found = _find_fault(run, renderer, views)
@@ -119,10 +114,6 @@ def _small(camera: Camera) -> Camera:
     return camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
 
 
-def _drawn(renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera]) -> _Pictures:
-    return [np.clip(renderer.render(scene, camera), 0.0, 1.0) for camera in cameras]
-
-
 def _photo(views: ViewSet, index: int) -> np.ndarray:
     from PIL import Image
 
@@ -137,7 +128,8 @@ def _photo(views: ViewSet, index: int) -> np.ndarray:
 
 def _compare(renderer: Renderer, scene: DeviceScene, views: ViewSet, indices: list[int]) -> _Compared:
     cameras = [_small(views.cameras[i]) for i in indices]
-    return _Compared(indices, cameras, _drawn(renderer, scene, cameras), [_photo(views, i) for i in indices])
+    renders = [np.clip(renderer.render(scene, camera), 0.0, 1.0) for camera in cameras]
+    return _Compared(indices, cameras, renders, [_photo(views, i) for i in indices])
 
 
 def _blind(renderer: Renderer, scene: DeviceScene, views: ViewSet, indices: list[int]) -> tuple[str, bool] | None:
@@ -170,11 +162,9 @@ def _some_bad(views: ViewSet, bad: list[int], known: int) -> str:
 
 def _misfit(compared: _Compared, bad: int, known: int) -> str:
     errors = [mse(a, b) for a, b in zip(compared.renders, compared.photos, strict=True)]
-    turned = [
-        mse(a, b)
-        for a, b in zip(compared.renders, _moved(compared.photos, len(compared.photos) // 2))
-        if a.shape == b.shape
-    ]
+    half = len(compared.photos) // 2
+    others = compared.photos[half:] + compared.photos[:half]
+    turned = [mse(a, b) for a, b in zip(compared.renders, others) if a.shape == b.shape]
     own, other = psnr(float(np.median(errors))), psnr(float(np.median(turned))) if turned else None
     against = (
         ""
@@ -187,10 +177,6 @@ def _misfit(compared: _Compared, bad: int, known: int) -> str:
         return f"the photos of neighbours fit the views better than their own do{against}."
     so = "so a drop against the photos would mean nothing"
     return f"{bad} of {known} compared views do not resemble their photo{against}, {so}."
-
-
-def _moved(values: list[_T], places: int) -> list[_T]:
-    return values[places:] + values[:places]
 
 
 def _shift_of_neighbours(compared: _Compared) -> int | None:
@@ -283,3 +269,40 @@ def _fitting_convention(frame: Frame, renderer: Renderer, scene: DeviceScene, co
                 if frame == RDF:
                     words += " Or give the cameras that belong to it."
     return words
+
+
+def details(image: np.ndarray) -> np.ndarray | None:
+    """What lies between the two scales of a picture, at unit norm; `None` for a picture that shows nothing.
+
+    Noise and fine texture are smoothed away, and so is light that changes slowly.
+
+    `image`: [H, W, 3] f32, `SIDE` pixels on the longer side. Returns [H, W, 3] f32.
+    """
+    smooth = _window_mean(_window_mean(np.clip(image, 0.0, 1.0).astype(np.float64), FINE), FINE)
+    found = smooth - _window_mean(smooth, COARSE)
+    found -= found.mean(axis=(0, 1))
+    norm = math.sqrt(float(np.square(found).sum()))
+    return None if norm < PLAIN * math.sqrt(found.size) else (found / norm).astype(np.float32)
+
+
+def likeness(first: np.ndarray | None, second: np.ndarray | None) -> float:
+    """Correlation of the details of two pictures, -1 to 1; 0 if one of them shows nothing, or if their sizes differ.
+
+    Pictures of the same thing are near 1. Others are near 0, also where sky and ground are alike.
+    """
+    if first is None or second is None or first.shape != second.shape:
+        return 0.0
+    return float(np.vdot(first, second))
+
+
+def _window_mean(planes: np.ndarray, reach: int) -> np.ndarray:
+    """Mean over windows of `2 reach + 1` pixels a side, which are cut off at the edges."""
+    for axis in (0, 1):
+        size = planes.shape[axis]
+        first = np.maximum(np.arange(size) - reach, 0)
+        behind = np.minimum(np.arange(size) + reach + 1, size)
+        sums = np.concatenate([np.zeros_like(planes.take([0], axis)), planes.cumsum(axis)], axis)
+        shape = [1, 1, 1]
+        shape[axis] = size
+        planes = (sums.take(behind, axis) - sums.take(first, axis)) / (behind - first).reshape(shape)
+    return planes

@@ -1,7 +1,5 @@
 """Collect what `info` says about a `.fgs` file."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +9,9 @@ import numpy as np
 
 from flexgs_edge.codec.open_fgs import read_header
 from flexgs_edge.codec.sections import ChunkEntry
-from flexgs_edge.codec.v1.header import Header
-from flexgs_edge.codec.v2.chunk_plan import Chunk
+from flexgs_edge.codec.v1.container import Header
 from flexgs_edge.codec.v2.container import GridContainer, Preview, channel_bytes
-from flexgs_edge.codec.v2.header import Channels, GridHeader, channel_parts
+from flexgs_edge.codec.v2.header import Channels, Chunk, GridHeader, channel_parts
 from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.packed.quantize import array_bytes

@@ -1,24 +1,21 @@
 """Decide how to decode a file: on which device, how many chunks ahead, to memory or to scratch files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from weakref import WeakKeyDictionary
 
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.codec.v2.header import CHUNK_ROWS
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
-from flexgs_edge.kernels.tested import processors_with_verdicts
+from flexgs_edge.kernels.tested import BUILD_BYTES, RUNTIME_BYTES, counted_backend, processors_with_verdicts
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.memory.storage import IN_MEMORY
+from flexgs_edge.progress import Stopwatch
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.counted_backend import BUILD_BYTES, RUNTIME_BYTES, counted_backend
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
 

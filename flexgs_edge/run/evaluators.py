@@ -1,9 +1,7 @@
 """The views that decide and those that report, prepared together and asked for the final figures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from flexgs_edge.cameras.camera import Camera
@@ -19,7 +17,7 @@ from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
 
 
-class Evaluators:
+class Evaluators(AbstractContextManager["Evaluators"]):
     """The judge that decides and the one that reports, the same object unless training poses decide; close when done.
 
     `run`: planned, with views. `renderer`: draws.
@@ -109,9 +107,6 @@ class Evaluators:
         for few in (self.training, self._made):
             if few is not None:
                 few.close()
-
-    def __enter__(self) -> Evaluators:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -1,8 +1,9 @@
-"""The original from a few poses that decide no target: how well a finished scene does there."""
-
-from __future__ import annotations
+"""The original from a few poses that decide no target: how well a finished scene does there, and poses made for that."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance
@@ -11,13 +12,16 @@ from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.depths import visible_depths
+from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.scene.source import SceneSource, without_degrees
+from flexgs_edge.small_matrices import product
 from flexgs_edge.views.references import References
 
 STEP = 2  # Every second pixel in both directions is read
 MOST = 8  # At most so many training poses, evenly spread, tell whether a result fits the scored poses too closely
 MADE_FROM = 6  # At most so many of the views that decide, evenly spread, get a nearer and a farther pose each
+MIDDLE = 3  # A camera looks at the middle one of so many parts of its frame, across and down
+TELLING = 32  # Most cameras that tell what is usual
 
 
 class FewPoses:
@@ -75,3 +79,45 @@ def made_poses(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera
         for camera, depth in zip(some, depths, strict=True)
         for times in (NEARER, FARTHER)
     ]
+
+
+def usual_depth(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> float:
+    """Median of `visible_depths`, scene units. The extent of the cameras says little of it: some stand near, some far."""
+    return float(np.median(visible_depths(renderer, source, cameras[:: -(-len(cameras) // TELLING)])))
+
+
+def middle_of(camera: Camera) -> Camera:
+    """The middle part of a camera's frame, as a camera of its own with the same pixels."""
+    left, top = (pixels // 2 - pixels // (2 * MIDDLE) for pixels in (camera.width, camera.height))
+    return replace(
+        camera,
+        width=max(camera.width // MIDDLE, 1),
+        height=max(camera.height // MIDDLE, 1),
+        cx=camera.cx - left,
+        cy=camera.cy - top,
+    )
+
+
+def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> list[float]:
+    """Distance of each camera to what it looks at: the median depth of the light in the middle of its frame.
+
+    A camera that sees nothing there gets the median of the others. If no camera sees anything, all get 1.
+
+    Returns scene units, one for each camera.
+    """
+    means = source.read(slice(0, source.count), ["means"])["means"]
+    depths = []
+    with renderer.load(without_degrees(source, 0)) as scene:
+        for camera in map(middle_of, cameras):
+            statistics = Statistics.zeros(source.count)
+            renderer.add_statistics(scene, camera, statistics)
+            rows = np.flatnonzero(statistics.weights)
+            moved = camera.moved(source.origin)
+            depth = product(moved.rotation[2:], means[:, rows].astype(np.float64))[0] + moved.translation[2]
+            order = np.argsort(depth, kind="stable")
+            light = np.cumsum(statistics.weights[rows][order])
+            depths.append(float(depth[order[np.searchsorted(light, light[-1] // 2)]]) if len(rows) else np.nan)
+    renderer.release()
+    known = [depth for depth in depths if depth == depth]
+    usual = float(np.median(known)) if known else 1.0
+    return [depth if depth == depth else usual for depth in depths]

@@ -1,7 +1,5 @@
 """A digest of everything that scores depend on, to know whether kept scores still apply."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 

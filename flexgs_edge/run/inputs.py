@@ -1,7 +1,5 @@
 """From a path to a checked scene, and to options with every drawing setting filled in."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,20 +10,17 @@ from flexgs_edge.cameras.read import NERF_SYNTHETIC, find_cameras
 from flexgs_edge.cameras.start import StartView
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.io.crops import crop_of
 from flexgs_edge.io.frames import RDF, Frame
 from flexgs_edge.io.model_folder import Companions, find_companions
 from flexgs_edge.io.ply import inria_dtype
-from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.io.reading import AS_WRITTEN, Reading, crop_of
 from flexgs_edge.progress import LOG
 from flexgs_edge.report.run_info import SceneInfo
 from flexgs_edge.run.open_scene import open_file
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.crop import Crop, cropped
-from flexgs_edge.scene.growth import GrownSource
-from flexgs_edge.scene.lower_sh import without_degrees
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scene.source import GrownSource, SceneSource, without_degrees
 
 
 def companions_of(path: str | os.PathLike[str]) -> Companions:

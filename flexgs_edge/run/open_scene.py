@@ -1,16 +1,19 @@
 """Open a scene file with the reader of its format: that of its suffix, or of its first bytes for every kind of PLY."""
 
-from __future__ import annotations
-
+import gzip
 import os
+import shutil
+import tempfile
+import weakref
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flexgs_edge.errors import FormatError, InputError
+from flexgs_edge.errors import DISK_FULL, BudgetError, FormatError, InputError
 from flexgs_edge.files import check_readable
 from flexgs_edge.io.formats import FORMATS, format_of
 from flexgs_edge.io.frames import RDF, Frame, FrameSource, in_frame
-from flexgs_edge.io.gzipped import GZ, unpacked
 from flexgs_edge.io.kinds import GZIP_MAGIC, Kind, kind_of
 from flexgs_edge.io.model_folder import latest_iteration
 from flexgs_edge.io.ply import PlySource
@@ -22,6 +25,11 @@ FOLDERS = ("lod-meta.json", "meta.json")  # Files that make a folder a scene, th
 SUFFIXES = (".fgs", ".ply", *FORMATS)
 _PLY = (".ply", ".compressed.ply")
 """Formats that a file has if its first bytes say so, whatever its suffix: both are called .ply in the wild."""
+GZ = ".gz"
+_BLOCK = 1 << 20
+LEAST_FREE = 1 << 28  # Bytes of the temporary disk that stay free
+MOST_TIMES = 200  # Scenes unpack to 1.1 to 10 times their size, and any gzip file to at most 1032 times
+SMALL = 1 << 26  # Unpacked bytes that need no such bound
 
 
 @dataclass(frozen=True)
@@ -35,19 +43,12 @@ class Opened:
     version: int | None  # version of the format, if the file states one
 
 
-def open_scene(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> SceneSource:
+def open_file(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> Opened:
     """Open a scene file by its suffix, the latest iteration of INRIA's model folder, or a folder of SOG pictures.
 
-    A folder that holds a `point_cloud.ply` stands for it.
-
-    What it returns has its axes in RDF. Raises `InputError` if the path does not exist or its suffix is unknown. Raises
-    `FormatError` if the file does not follow its format.
+    A folder that holds a `point_cloud.ply` stands for it. Raises `InputError` if the path does not exist or its suffix is
+    unknown. Raises `FormatError` if the file does not follow its format.
     """
-    return open_file(path, reading).source
-
-
-def open_file(path: str | os.PathLike[str], reading: Reading = AS_WRITTEN) -> Opened:
-    """Open a scene as `open_scene` does, and say what its file is."""
     place = scene_file(path)
     if reading.lod is not None and not place.name.lower().endswith("lod-meta.json"):
         raise InputError(
@@ -96,7 +97,9 @@ def _open(place: Path, file_name: str, name: str, reading: Reading) -> tuple[str
     lower = file_name.lower()
     found = kind_of(place, name)
     if lower.endswith(GZ):
-        if _starts_with_gzip(place):
+        with open(place, "rb") as file:
+            packed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+        if packed:
             suffixes = []
 
             def open_inner(inner: Path) -> SceneSource:
@@ -142,11 +145,57 @@ def _refused(kind: Kind, name: str) -> FormatError:
     return kind.refused(name) if kind.suffix is None else kind.renamed(name, SUFFIXES)
 
 
-def _starts_with_gzip(place: Path) -> bool:
-    with open(place, "rb") as file:
-        return file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
-
-
 def _supported() -> str:
     suffixes = ", ".join(SUFFIXES)
     return f"supported: files ending in {suffixes}, each also with {GZ}, or a model folder with point_cloud/iteration_*"
+
+
+def unpacked(
+    path: Path, name: str, open_file: Callable[[Path], SceneSource], least_free: int = LEAST_FREE
+) -> SceneSource:
+    """Unpack a file into the folder that TMPDIR names, and open it there.
+
+    `path`: the packed file. `name`: the user's path, for messages. `open_file`: opens the unpacked file. `least_free`:
+    bytes of the temporary disk that must stay free. Raises `InputError` if the file cannot be read. Raises
+    `FormatError` if it is no whole gzip file, or unpacks to far more than a scene would. Raises `BudgetError` if the
+    temporary disk has no room for it.
+    """
+    check_readable(path, name)
+    folder = tempfile.TemporaryDirectory(prefix="flexgs-")
+    try:
+        place = Path(folder.name) / "scene"
+        _unpack(path, name, place, least_free)
+        source = open_file(place)
+    except BaseException:
+        folder.cleanup()
+        raise
+    weakref.finalize(source, folder.cleanup)
+    return source
+
+
+def _unpack(path: Path, name: str, place: Path, least_free: int) -> None:
+    try:
+        most, size = max(SMALL, MOST_TIMES * os.stat(path).st_size), 0
+        with gzip.open(path) as packed, open(place, "wb") as file:
+            while block := packed.read(_BLOCK):
+                size += len(block)
+                if size > most:
+                    raise FormatError(
+                        f"{name}: unpacks to more than {most} bytes, {MOST_TIMES} times its size: this is no scene; if it is, "
+                        "unpack it first with gunzip"
+                    )
+                file.write(block)
+                free = shutil.disk_usage(place.parent).free
+                if free < least_free:
+                    raise BudgetError(
+                        f"{name}: unpacked, it does not fit into {place.parent.parent}: {free} bytes are left there; "
+                        "free some space, or let TMPDIR name another folder"
+                    )
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise FormatError(f"{name}: not a whole gzip file ({error}); is it complete?") from error
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            raise BudgetError(
+                f"{name}: the disk is full while it is unpacked; let TMPDIR name another folder"
+            ) from error
+        raise InputError(f"{name}: cannot read the scene ({os.strerror(error.errno or 0)})") from error

@@ -28,7 +28,7 @@ from flexgs_edge.goals.promise import (
 from flexgs_edge.goals.steps import REFINE_STEPS, Choice
 from flexgs_edge.goals.target import Figure, MaxDrop, MaxSize, MinFidelity, Target, min_ratio
 from flexgs_edge.io.reading import Reading, Writing
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.quality.psnr import modelled_drop, mse_of_psnr
 
 NO_PHOTOS = "none"  # `--images none`: do not use the photos beside the scene
@@ -40,6 +40,8 @@ SCORES = ("gs", "meson")
 SELECTS = ("test", "train")
 EXPOSURES = ("fit", "none")
 PROMISES = ("whole", "mean")
+GENTLE = "gentle"
+CLEANS = (GENTLE, "thorough")
 NONE = "none"  # Lifts a bound of the promise
 LAYERS_MOST = 4
 FINETUNE_MOST = 100_000
@@ -176,6 +178,8 @@ class CompressOptions(ViewOptions):
     groups: int | None = None
     base_psnr: float | None = None
     trust_views: bool = False
+    clean: str | None = None
+    keep_removed: str | None = None
     effort: str = "balanced"
     best_effort: bool = False
     unseen: str = "keep"
@@ -202,6 +206,7 @@ class CompressOptions(ViewOptions):
             ("--select", self.select, SELECTS),
             ("--effort", self.effort, EFFORT_WORDS),
             ("--promise", self.promise, PROMISES),
+            ("--clean", self.clean or GENTLE, CLEANS),
         ):
             if value not in known:
                 raise InputError(f"{word} {value!r}: expected one of {', '.join(known)}")
@@ -224,6 +229,10 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.preview is not None and not 0 <= self.preview <= PREVIEW_MOST:
             raise InputError(f"--preview {self.preview}: expected 0 (none) to {PREVIEW_MOST} bytes")
+        if self.keep_removed is not None and self.clean is None:
+            raise InputError(
+                "--keep-removed: nothing is removed without --clean: give it too, or leave --keep-removed out"
+            )
         _ = self.writing
         self._check_targets()
         self.bit_spec()

@@ -1,7 +1,5 @@
 """Files that `compress` writes: checked before any work, published only when they are whole."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +30,10 @@ def check_output(output: str | os.PathLike[str] | None, options: CompressOptions
     format = _foreign_format(output, options)
     if options.score_cache is not None:
         check_writable(options.score_cache, force=True)
+    if options.keep_removed is not None:
+        if Path(options.keep_removed).suffix.lower() != ".ply":
+            raise InputError(f"--keep-removed {options.keep_removed}: expected a name that ends in .ply")
+        check_writable(options.keep_removed, options.force)
     if options.dry_run:
         return Output(None, format)
     if output is None:

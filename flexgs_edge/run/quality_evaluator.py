@@ -1,7 +1,5 @@
 """Compare a scene with renders of the original and with photos, kept in memory as far as the budget allows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,9 +12,8 @@ from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
 from flexgs_edge.progress import SILENT, Progress
-from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips
 from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, lone_base, moved_error, mse, with_gains
-from flexgs_edge.quality.ssim import ssim_bytes, ssims
+from flexgs_edge.quality.similarity import flip_bytes, flip_maps, flips, ssim_bytes, ssims
 from flexgs_edge.quality.view_quality import Distance, Quality, ViewQuality, compare_view, with_flip
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
@@ -70,7 +67,7 @@ class QualityEvaluator:
         self.photos = views.photos if with_photos else None
         self._fits_exposure = views.fits_exposure
         self.covered_decides = views.photos is None
-        self._automatic = views.cameras_from == AUTO_CAMERAS
+        self._automatic = views.automatic
         self.base_psnr = DEFAULT_BASE_PSNR if base_psnr is None else base_psnr
         self._given_base = base_psnr
         self.reports = reports
@@ -88,7 +85,8 @@ class QualityEvaluator:
         self.made: FewPoses | None = None  # Made poses that whole comparisons look at too
         # Reserve the memory now: scenes that are loaded later must not count on it.
         images = 1 if self.photos is None else 2
-        wanted = sum(camera.width * camera.height + _coarse_pixels(camera) for camera in self.cameras) * 12 * images
+        sizes = [size for camera in self.cameras for size in (camera, camera.every(ESTIMATE_STEP))]
+        wanted = sum(size.width * size.height for size in sizes) * 12 * images
         self._work = work_bytes(self.cameras)
         budget.take("comparing views", self._work)
         self._reserved = min(wanted, budget.free // SHARE)
@@ -328,12 +326,6 @@ class QualityEvaluator:
             return None
         held = self._held(("photo", i))
         return with_gains(self.photos.load(self.indices[i]), self._gains[i], original) if held is None else held
-
-
-def _coarse_pixels(camera: Camera) -> int:
-    """Number of pixels that an estimate reads."""
-    few = camera.every(ESTIMATE_STEP)
-    return few.width * few.height
 
 
 def measurement_of(quality: Quality) -> Measurement:

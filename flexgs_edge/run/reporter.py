@@ -17,14 +17,22 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write, check_writable
 from flexgs_edge.goals.target import Target
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import LOG, SILENT, Progress
+from flexgs_edge.progress import LOG, SILENT, Progress, Stopwatch
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.material import FLIP_SCALE, Live, Material, Shot, error_map, ramp
-from flexgs_edge.report.pages import compress_page, evaluate_page
+from flexgs_edge.report.pages import (
+    FLIP_SCALE,
+    Cleaned,
+    Live,
+    Material,
+    Shot,
+    compress_page,
+    error_map,
+    evaluate_page,
+    ramp,
+)
 from flexgs_edge.report.results import CompressResult, EvaluateResult
-from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.open_scene import is_fgs
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
@@ -133,6 +141,7 @@ class Reporter:
         self._shots: tuple[Shot, ...] = ()
         self._contents: dict[str, Any] | None = None
         self._live: Live | None = None
+        self._cleaned: Cleaned | None = None
         self._check()
 
     @classmethod
@@ -184,6 +193,13 @@ class Reporter:
             write(place)
             self.read_contents(place)
 
+    def show_cleaned(self, camera: Camera, before: np.ndarray, after: np.ndarray, removed: np.ndarray) -> None:
+        """Show a view of a scene before and after a cleaning, and of what went: [H, W, 3] f32 each."""
+        width, height = size = shown_size(camera)
+        self._cleaned = Cleaned(
+            camera.name, width, height, *(encode(image, size) for image in (before, after, removed))
+        )
+
     def show_live(self, make: Callable[[int], Live]) -> None:
         """Put live scenes beside the pictures; `make` gets the camera of the first picture."""
         if self._shots:
@@ -191,7 +207,7 @@ class Reporter:
 
     def write(self, result: CompressResult | EvaluateResult, target: Target | None = None) -> Path:
         """Write the page and the record: both, or neither if writing fails. Returns the path of the page."""
-        material = Material(self._shots, self._contents, target, self._live)
+        material = Material(self._shots, self._contents, target, self._live, self._cleaned)
         words = (
             compress_page(result, material) if isinstance(result, CompressResult) else evaluate_page(result, material)
         )

@@ -1,4 +1,4 @@
-"""What was asked, and of what: the record that a command opens once and every step reads."""
+"""What was asked, of what, and the plan: the record that a command opens once and every step reads."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ from typing import Generic
 
 import numpy as np
 
+from flexgs_edge.cameras.auto import USUAL_COUNT
 from flexgs_edge.errors import InputError
-from flexgs_edge.goals.target import Target
+from flexgs_edge.goals.promise import MadePoses, Promised
+from flexgs_edge.goals.steps import Choice
+from flexgs_edge.goals.target import Figure, Target
 from flexgs_edge.io.exchange import MovedSource, check_positions
+from flexgs_edge.io.frames import RDF
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import LOG, SILENT, Progress
-from flexgs_edge.run.background import Colour, contrasting_background
-from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.progress import LOG, SILENT, Progress, Stopwatch
+from flexgs_edge.report.run_info import RemovedGroup
 from flexgs_edge.run.inputs import (
     CheckedScene,
     Options,
@@ -29,11 +32,94 @@ from flexgs_edge.run.inputs import (
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import NO_CAMERAS, NO_PHOTOS, CompressOptions
 from flexgs_edge.run.outputs import NO_OUTPUT, Output, check_output
-from flexgs_edge.run.plan import Plan
 from flexgs_edge.run.reporter import Reporter
-from flexgs_edge.run.view_set import WITHOUT_VIEWS, GivenViews, ViewSet, find_views, near_enough
-from flexgs_edge.run.warnings import frame_warnings
-from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.run.view_set import (
+    WITHOUT_VIEWS,
+    Colour,
+    GivenViews,
+    ViewSet,
+    contrasting_background,
+    find_views,
+    near_enough,
+)
+from flexgs_edge.scene.check import without_hidden
+from flexgs_edge.scene.source import SceneSource, SelectSource, some_positions
+from flexgs_edge.small_matrices import product
+
+EVERYTHING = Choice(0, 0)
+BEHIND_SHARE = 0.5  # We warn when more than this share of the Gaussians lies behind all cameras
+_SAMPLE_ROWS = 2048
+_SAMPLE_VIEWS = 64
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Views, target and scores of a run."""
+
+    # Views that decide when the search stops: the held-out views, or the training views with `--select train`.
+    decide: list[int]
+    # Views that the final figures come from: the held-out views, or the training views if none are held out.
+    report: list[int]
+    figure: Figure  # the kind of drop that decides: `drop` against photos, else `modelled drop`
+    target: Target | None  # `None` for fixed rates
+    needs_scores: bool  # whether the method computes importance scores
+
+    @classmethod
+    def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:
+        fixed = options.fixed
+        needs_scores = fixed != EVERYTHING and options.method == "paper"
+        if views is None:
+            if options.clean is not None:
+                raise InputError(f"{WITHOUT_VIEWS}. --clean {options.clean}: views judge what goes")
+            if options.method != "paper":
+                raise InputError(
+                    f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
+                    "--method paper with both rates 0 works"
+                )
+            if fixed is None or needs_scores:
+                why = "to score Gaussians and to judge the result" if fixed is None else "to score Gaussians"
+                raise InputError(
+                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only --prune-rate 0 and --sh-rate 0 work"
+                )
+            return cls([], [], "modelled drop", None, needs_scores)
+        if options.select == "test" and not views.held_out:
+            raise InputError(
+                "--holdout 0 leaves no view to decide on: use --select train as well, or another --holdout"
+            )
+        if not views.train and (options.method != "paper" or needs_scores or options.select == "train"):
+            raise InputError(
+                f"{views.cameras_from}: {len(views.cameras)} views, all of them held out (every {options.holdout}th by name): "
+                "give more views, or --holdout 0 --select train"
+            )
+        on_train = options.select == "train"
+        figure: Figure = "drop" if views.photos is not None and not on_train else "modelled drop"
+        return cls(
+            decide=views.train if on_train else views.held_out,
+            report=views.held_out or views.train,
+            figure=figure,
+            target=options.target(figure, scene.ply_bytes),
+            needs_scores=needs_scores,
+        )
+
+    @property
+    def makes_poses(self) -> bool:
+        """Whether the promise is about made poses too."""
+        target = self.target
+        return isinstance(target, Promised) and any(isinstance(part, MadePoses) for part in target.parts)
+
+    @property
+    def decided_by(self) -> str | None:
+        """Name of the deciding figure: `drop`, `modelled drop`, `fidelity` or `size`; `None` for fixed rates."""
+        if self.target is None:
+            return None
+        return "size" if self.target.limit_bytes is not None else self.target.figure
+
+    @staticmethod
+    def kind_of(indices: list[int], views: ViewSet | None) -> str:
+        """Name of the kind of views at `indices`: `held-out`, `training` or `none`."""
+        if not indices or views is None:
+            return "none"
+        return "held-out" if indices == views.held_out else "training"
 
 
 @dataclass(frozen=True)
@@ -51,6 +137,8 @@ class Run(Generic[Options]):
     output: Output = NO_OUTPUT  # the file that `compress` writes
     judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
     background: Colour | None = None  # before which views are compared, if it is not that of the options
+    removed: tuple[RemovedGroup, ...] = ()  # the kinds that `--clean` found
+    removed_rows: SceneSource | None = None  # the Gaussians that `--clean` removed
     warnings: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
 
     @property
@@ -84,7 +172,7 @@ def open_run(
     photos: bool = True,  # look for photos as well as for cameras
     judged_path: ScenePlace | None = None,
     given: GivenViews | None = None,  # cameras and photos from memory, instead of those that the options name
-    decodes: bool = True,  # the command decodes a `.fgs`; if not, nothing is read of it here either
+    decodes: bool = True,  # the command decodes a `.fgs`; `view` does not, and needs views to look through alone
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
 
@@ -100,6 +188,8 @@ def open_run(
             companions = merge_companions(companions, _beside(judged_path))
         scene = load_scene(path, options.drop_invalid, replace(options.reading, budget=budget))
         budget.hold(scene.held_bytes)
+        if isinstance(options, CompressOptions):
+            scene = replace(scene, source=without_hidden(scene.source))
         judged = None
         if judged_path is not None:
             judged = load_scene(judged_path, options.drop_invalid, Reading(budget=budget))
@@ -119,7 +209,8 @@ def open_run(
             options = replace(options, cameras=NO_CAMERAS)  # the file says where to start: no view has to be placed
         asked = options.near
         options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
-        views = find_views(options, companions, scene.source, photos and scene.crop is None, given, budget)
+        placed = scene.source if decodes else _sample(scene.source)
+        views = find_views(options, companions, placed, photos and scene.crop is None, given, budget)
         found_beside = given is None and options.cameras is None and companions.cameras is not None
         if found_beside and views is not None and scene.start is not None and not scene.start.is_of(views.cameras):
             LOG.warning(
@@ -127,13 +218,19 @@ def open_run(
                 *(companions.cameras, scene.path),
             )
             companions = replace(companions, cameras=None, images=None)
-            views = find_views(options, companions, scene.source, False, None, budget)
+            views = find_views(options, companions, placed, False, None, budget)
         if asked is None and views is not None:
             options, views = near_enough(options, views)
         found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
     return Run(options, scene, views, None, budget, clock, progress, reporter, judged=judged, warnings=found)
+
+
+def _sample(source: SceneSource) -> SceneSource:
+    """A scene from which views are placed in seconds, however large it is: they are only looked through."""
+    step = source.count // USUAL_COUNT
+    return source if step < 2 else SelectSource(source, np.arange(0, source.count, step))
 
 
 def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:
@@ -156,6 +253,7 @@ def open_compression(
     Raises `InputError` when a file cannot be written or read, or the options do not fit together.
     """
     place = check_output(output, options)
+    options = replace(options, drop_invalid=options.drop_invalid or options.clean is not None)
     reporter = Reporter.maybe(options.report, options.force)
     run = replace(planned(open_run(path, options, progress, reporter, given=given)), output=place)
     with run.clock.stage("open"):
@@ -197,3 +295,37 @@ def _beside(place: ScenePlace) -> Companions:
     """What lies beside a scene; nothing beside one from memory."""
     path = place.path if isinstance(place, CheckedScene) else place
     return Companions() if path is None else companions_of(path)
+
+
+def frame_warnings(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
+    """Warn if the scene lies behind the cameras, or out of sight of most: a sample of positions and cameras tells.
+
+    Files of phones often break the rule of their format. Cameras around a scene tell nothing of that, as it lies before some of
+    them either way.
+    """
+    if views.automatic:
+        return ()
+    means = some_positions(scene.source, _SAMPLE_ROWS)
+    behind = np.ones(means.shape[1], bool)
+    cameras = views.cameras[:: -(-len(views.cameras) // _SAMPLE_VIEWS)]
+    blind = 0
+    for camera in cameras:
+        x, y, z = product(camera.rotation, means) + camera.translation[:, None]
+        behind &= z <= 0
+        depth = np.maximum(z, 0.0)
+        across, down = camera.fx * x + camera.cx * depth, camera.fy * y + camera.cy * depth
+        inside = (across > 0) & (across < camera.width * depth) & (down > 0) & (down < camera.height * depth)
+        blind += not inside.any()
+    share = float(behind.mean())
+    if scene.frame != RDF and share > BEHIND_SHARE:
+        return (
+            f"{100 * share:.0f} % of the Gaussians lie behind all {len(views.cameras)} cameras of {views.cameras_from}. The "
+            f"file's axes were read as {scene.frame.name} (x, y, z) and turned into RDF. Give the right ones with --frame, "
+            "such as --frame RDF for a file in the cameras' own frame.",
+        )
+    if 2 * blind > len(cameras):
+        return (
+            f"{blind} of {len(cameras)} compared cameras of {views.cameras_from} have nothing of the scene in sight: they look "
+            "away from it or are far from it. Are the cameras in the scene's frame?",
+        )
+    return ()

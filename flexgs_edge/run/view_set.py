@@ -1,9 +1,10 @@
-"""The views of a run: cameras, photos, and the split into training and held-out views."""
+"""The views of a run: cameras, photos, the split into training and held-out views, and the background behind them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,33 +13,41 @@ import numpy as np
 
 from flexgs_edge.cameras.auto import automatic_rig
 from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, split_views
+from flexgs_edge.cameras.candidates import Show
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.cameras.scene_sample import READ_ROWS
 from flexgs_edge.cameras.start import StartView, start_view
+from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
+from flexgs_edge.kernels.backend import Backend
+from flexgs_edge.kernels.tested import counted_backend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.progress import LOG
+from flexgs_edge.progress import LOG, Stopwatch
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.report.run_info import ViewsInfo
-from flexgs_edge.run.clock import Stopwatch
-from flexgs_edge.run.counted_backend import counted_backend
 from flexgs_edge.run.inputs import Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
-from flexgs_edge.scene.source import SceneSource, some_positions
-from flexgs_edge.views.sketch import sketch
+from flexgs_edge.scene.source import MemorySource, SceneSource, some_positions
 
 MEMORY = "memory"  # Takes the place of a path in records when cameras or photos came from memory
 PLACING_BYTES = 90  # Bytes a row that are held while Gaussians are compared with those around them
 WITHOUT_VIEWS = f"--cameras {NO_CAMERAS} leaves no views: leave it out for automatic ones, or give --cameras PATH"
+Colour = tuple[float, float, float]
+
+ALIKE = 0.1  # A colour is that of the background if no channel differs by more than this
+MOST_SHARE = 0.1  # We take another background if more than this share of the matter has the colour of the one before
+BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0)}
+SAMPLE_ROWS = 1 << 16
+LARGEST = 0.99  # Splats larger than this quantile count as this large: a sky is not most of the matter
+NEAR = 1e-3  # Near plane, in units of the scene's smallest part
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """Views in order of name, and their split.
-
-    `train`, `held_out`: indices into `cameras`.
-    """
+    """Views in order of name, and their split. `train`, `held_out`: indices into `cameras`."""
 
     cameras: list[Camera]  # in world coordinates, at the size they are drawn
     photos: Photos | None  # one photo per camera
@@ -51,12 +60,17 @@ class ViewSet:
     near: float | None = None  # largest near plane that does not cut off what automatic views show, scene units
     fits_exposure: bool = True  # photos are fitted to the exposure of the original before they are compared
 
+    @property
+    def automatic(self) -> bool:
+        """Whether the cameras were placed for want of others."""
+        return self.cameras_from == AUTO_CAMERAS
+
     def start(self, source: SceneSource) -> StartView:
         """The view that a viewer starts from: `start_view` of all cameras, or of the better half of automatic ones.
 
         These are in order of what they add, and the last ones show what is seldom seen.
         """
-        if self.cameras_from != AUTO_CAMERAS:
+        if not self.automatic:
             return start_view(self.cameras, some_positions(source))
         order = [*self.train, *self.held_out]
         return start_view(self.of(order), some_positions(source), -(-len(order) // 2))
@@ -199,3 +213,45 @@ def views_info(views: ViewSet) -> ViewsInfo:
         height=max(camera.height for camera in views.cameras),
         notes=views.notes,
     )
+
+
+def contrasting_background(source: SceneSource, usual: Colour) -> tuple[Colour, str | None]:
+    """A background that the scene stands out from: `usual` unless much of the matter has its colour.
+
+    Before its own colour, matter could go without any picture telling. Returns the colour, and a note if it is another one.
+    """
+    rows = np.arange(0, source.count, max(-(-source.count // SAMPLE_ROWS), 1))
+    planes = source.read(rows, ["sh_dc", "opacity_logits", "log_scales"])
+    colours = planes["sh_dc"].astype(np.float64) * SH_C0 + 0.5
+    logs = np.sort(np.clip(planes["log_scales"].astype(np.float64), -40, 40), axis=0)[1:].sum(axis=0)
+    areas = np.exp(np.minimum(logs, np.quantile(logs, LARGEST)))
+    areas /= 1 + np.exp(-np.clip(planes["opacity_logits"][0].astype(np.float64), -60, 60))
+
+    def share(background: Colour) -> float:
+        alike = np.all(np.abs(np.clip(colours, 0, 1) - np.array(background)[:, None]) <= ALIKE, axis=0)
+        return float(areas[alike].sum() / max(float(areas.sum()), 1e-300))
+
+    hidden = share(usual)
+    if hidden <= MOST_SHARE:
+        return usual, None
+    name = next((name for name, each in BACKGROUNDS.items() if share(each) <= MOST_SHARE), "green")
+    return BACKGROUNDS[
+        name
+    ], f"compared before {name}: {100 * hidden:.0f} % of the matter has the colour of the background"
+
+
+@contextmanager
+def sketch(backend: Backend, budget: MemoryBudget, planes: dict[str, np.ndarray]) -> Iterator[Show]:
+    """What shows a small scene ({field: [width, M] f32}) from any camera, while the context lasts."""
+    source = MemorySource(planes)
+    renderer = Renderer(backend, budget, NEAR)
+    with renderer.load(source) as scene:
+
+        def show(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+            statistics = Statistics.zeros(source.count)
+            renderer.add_statistics(scene, camera, statistics)
+            rows = np.flatnonzero(statistics.weights)
+            return rows, statistics.weight_sums[rows]
+
+        yield show
+    renderer.release()

@@ -1,22 +1,27 @@
-"""Check a scene before work starts: at least one Gaussian, finite values, usable rotations."""
+"""Check a scene before work starts: at least one Gaussian, finite values, usable rotations; and which rows can show."""
 
-from __future__ import annotations
-
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from flexgs_edge.constants import ALPHA_MIN
+from flexgs_edge.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from flexgs_edge.errors import InputError
+from flexgs_edge.memory.rows import BLOCK_ROWS
 from flexgs_edge.progress import LOG
 from flexgs_edge.scene.fields import FIELDS, OPACITY_LIMIT
-from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource, WrappedSource
+from flexgs_edge.scene.source import Planes, SceneSource, SelectSource, WrappedSource
 
 TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
 """Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is
 NaN."""
+MOST_ALIKE = math.ceil(math.log(TRANSMITTANCE_MIN) / math.log1p(-ALPHA_MIN)) + 1
+"""So many splats of one shape and place end every pixel that they reach, and one more for rounding. Later ones never show."""
+SHAPE = "means", "log_scales", "quats", "opacity_logits"  # Fields that decide where a splat is how opaque
+MULTIPLIERS = np.random.default_rng(0).integers(2**63, size=(11, 1), dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+BUCKET_BITS = 16  # Leading bits of a hash by which rows are counted first
 
 
 class _Faults:
@@ -131,15 +136,12 @@ class _FiniteSource(WrappedSource):
         super().__init__(parent, notes)
         self.floor, self.valid = np.float32(floor), True
 
-    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
-        planes = self.parent.read(rows, fields, out)
+    def change(self, planes: Planes) -> None:
         if "log_scales" in planes:
             np.maximum(planes["log_scales"], self.floor, out=planes["log_scales"])
         if "opacity_logits" in planes:
             logits = planes["opacity_logits"]
             np.copyto(logits, np.copysign(np.float32(OPACITY_LIMIT), logits), where=np.isinf(logits))
-        return planes
 
 
 def alive(logits: np.ndarray) -> np.ndarray:
@@ -153,3 +155,43 @@ def invisible(source: SceneSource) -> InputError:
         f"{source.name}: no Gaussian is opaque enough to be drawn: all {source.count} have an opacity below 1/255, and nothing "
         "would be left. Check that the file is a trained scene, with opacities before the sigmoid (logits)"
     )
+
+
+def without_hidden(source: SceneSource) -> SceneSource:
+    """The scene without splats that no view can show, since `MOST_ALIKE` of the same shape and place come before them.
+
+    All pictures stay as they are. Returns `source` itself, or a lazy source over it with a note.
+    """
+    counts = np.zeros(1 << BUCKET_BITS, np.int64)
+    for rows in source.chunks(BLOCK_ROWS):
+        counts += np.bincount(_buckets(source, rows), minlength=len(counts))
+    crowded = counts > MOST_ALIKE
+    if not crowded.any():
+        return source
+    keep, known = np.ones(source.count, bool), dict[int, int]()
+    for rows in source.chunks(BLOCK_ROWS):
+        some = np.flatnonzero(crowded[_buckets(source, rows)])
+        shapes, place, sizes = np.unique(_hashes(source, rows, SHAPE)[some], return_inverse=True, return_counts=True)
+        before = np.array([known.get(shape, 0) for shape in shapes.tolist()], np.int64)
+        known.update(zip(shapes.tolist(), (before + sizes).tolist(), strict=True))
+        order = np.argsort(place, kind="stable")
+        first = np.cumsum(sizes) - sizes - before
+        keep[rows.start + some[order]] = np.arange(len(some)) - first[place[order]] < MOST_ALIKE
+    if keep.all():
+        return source
+    hidden = int(source.count - keep.sum())
+    note = f"{hidden} of {source.count} Gaussians left out: {MOST_ALIKE} of the same shape and place hide each of them"
+    return SelectSource(source, np.flatnonzero(keep), (note,))
+
+
+def _buckets(source: SceneSource, rows: slice) -> np.ndarray:
+    """[n] i64, a number for each row that is the same for all at one place."""
+    return (_hashes(source, rows, SHAPE[:1]) >> np.uint64(64 - BUCKET_BITS)).astype(np.int64)
+
+
+def _hashes(source: SceneSource, rows: slice, fields: Sequence[str]) -> np.ndarray:
+    """[n] u64, a hash of the bits of the fields for each row."""
+    planes = source.read(rows, fields)
+    words = np.concatenate([planes[field].view(np.uint32) for field in fields])
+    hashes: np.ndarray = (words * MULTIPLIERS[: len(words)]).sum(axis=0, dtype=np.uint64)
+    return hashes

@@ -57,8 +57,7 @@ class Contraction:
     def octaves(self, means: np.ndarray) -> np.ndarray:
         """[n] i64, floor(log2 m) of positions [3, n], inside the radius too; -`OCTAVES` at least."""
         away = np.abs(means.astype(np.float64) - np.array(self.centre)[:, None]).max(axis=0) / self.radius
-        octaves: np.ndarray = np.frexp(np.maximum(away, 2.0**-OCTAVES))[1].astype(np.int64) - 1
-        return octaves
+        return np.frexp(np.maximum(away, 2.0**-OCTAVES))[1].astype(np.int64) - 1
 
     def to_json(self) -> dict[str, Any]:
         """The fields as JSON values."""

@@ -1,7 +1,5 @@
 """The Morton curve, on which neighbours are near each other in space."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.memory.rows import blocks, put_rows, read_rows
@@ -15,8 +13,7 @@ def morton(cells: np.ndarray) -> np.ndarray:
     [4, 9]
     """
     x, y, z = (_spread(axis.astype(np.uint64)) for axis in cells)
-    index: np.ndarray = x << np.uint64(2) | y << np.uint64(1) | z
-    return index
+    return x << np.uint64(2) | y << np.uint64(1) | z
 
 
 def near_rows(means: np.ndarray, storage: Storage = IN_MEMORY) -> np.ndarray:

@@ -1,7 +1,5 @@
 """The table of a Gaussian's attributes: names, widths, meaning and PLY properties. No other place repeats them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,11 +1,14 @@
-"""Rotations of Gaussians: normal form, turns, and the choice among the 24 equal forms of one Gaussian."""
-
-from __future__ import annotations
+"""Rotations of Gaussians: normal form, turns, and the choice among the 24 equal forms of one Gaussian; and SH that are turned."""
 
 import numpy as np
 
+from flexgs_edge.constants import MAX_SH_DEGREE, SH_C1, SH_C2, SH_C3, SH_C4
 from flexgs_edge.errors import InputError
-from flexgs_edge.small_matrices import product
+from flexgs_edge.scene.fields import sh_rest_count
+from flexgs_edge.small_matrices import product, quaternion_product, rotation_matrix
+
+_DIRECTIONS = 60  # Directions in which functions are compared: many more than the 9 functions of the widest band
+_DIGITS = 13  # Decimals of the matrices. Digits beyond them differ between processors.
 
 
 def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -27,9 +30,10 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
     square = wide * wide
     norm = np.sqrt((square[0] + square[1]) + (square[2] + square[3]))
     wide /= norm
-    best = _nearest_cube_rotation(wide)
-    turned = _times_conjugate(wide, best)
-    return turned * np.where(turned[0] < 0, -1.0, 1.0), np.take_along_axis(log_scales, _axes(best), axis=0)
+    back = _nearest_cube_rotation(wide) * np.array([[1.0], [-1.0], [-1.0], [-1.0]])
+    turned = quaternion_product(wide, back)
+    axes = np.argmax(np.abs(rotation_matrix(back)), axis=0)  # the old axis behind each new axis
+    return turned * np.where(turned[0] < 0, -1.0, 1.0), np.take_along_axis(log_scales, axes, axis=0)
 
 
 def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -37,15 +41,13 @@ def turned(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     wide = np.asarray(quats, np.float64)
     w, axis = wide[0], wide[1:]
     across = 2 * np.cross(axis, vectors, axis=0) / (wide * wide).sum(axis=0)
-    result: np.ndarray = vectors + w * across + np.cross(axis, across, axis=0)
-    return result
+    return vectors + w * across + np.cross(axis, across, axis=0)
 
 
 def matrices(quats: np.ndarray) -> np.ndarray:
     """[n, 3, 3] f64, rotation matrices of quaternions ([4, n], any norm but zero)."""
     columns = [turned(quats, np.broadcast_to(axis[:, None], (3, quats.shape[1]))) for axis in np.eye(3)]
-    found: np.ndarray = np.stack(columns, axis=-1).transpose(1, 0, 2)
-    return found
+    return np.stack(columns, axis=-1).transpose(1, 0, 2)
 
 
 def quats_of(rotations: np.ndarray) -> np.ndarray:
@@ -64,8 +66,7 @@ def quats_of(rotations: np.ndarray) -> np.ndarray:
     )
     largest = np.argmax(np.einsum("iin->in", outer), axis=0)
     quats = np.take_along_axis(outer, largest[None, None], axis=0)[0]
-    found: np.ndarray = quats / np.sqrt((quats * quats).sum(axis=0))
-    return found
+    return quats / np.sqrt((quats * quats).sum(axis=0))
 
 
 def times(first: np.ndarray, quats: np.ndarray) -> np.ndarray:
@@ -82,7 +83,7 @@ def tilted(quats: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """
     unit = np.asarray(quats, np.float64)
     unit = unit / np.sqrt((unit * unit).sum(axis=0))
-    return _times_conjugate(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *-errors]))
+    return quaternion_product(unit, np.stack([np.sqrt(1 - (errors * errors).sum(axis=0)), *errors]))
 
 
 def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
@@ -101,33 +102,7 @@ def _nearest_cube_rotation(quats: np.ndarray) -> np.ndarray:
     np.put_along_axis(pair_weights, places[:2], half, axis=0)
     weights[:, pairs] = pair_weights[:, pairs]
     weights[:, (four > one) & (four > two)] = 0.5
-    nearest: np.ndarray = weights * sign
-    return nearest
-
-
-def _times_conjugate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of quaternions `a` and the conjugate of `b`, [4, n] each."""
-    w, x, y, z = a
-    bw, bx, by, bz = b[0], -b[1], -b[2], -b[3]
-    return np.stack(
-        [
-            (w * bw - x * bx) - (y * by + z * bz),
-            (w * bx + x * bw) + (y * bz - z * by),
-            (w * by - x * bz) + (y * bw + z * bx),
-            (w * bz + x * by) - (y * bx - z * bw),
-        ]
-    )
-
-
-def _axes(quats: np.ndarray) -> np.ndarray:
-    """[3, n], the old axis behind each new axis, for conjugates of rotations of the cube."""
-    w, x, y, z = quats[0], -quats[1], -quats[2], -quats[3]
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.argmax(np.abs(np.stack(column)), axis=0) for column in columns])
+    return weights * sign
 
 
 def normalize_quats(quats: np.ndarray) -> np.ndarray:
@@ -145,3 +120,67 @@ def normalize_quats(quats: np.ndarray) -> np.ndarray:
         raise InputError(f"quats: {len(zero)} quaternions are zero and have no direction: use --drop-invalid")
     wide /= np.where(wide[0] < 0, -norm, norm)
     return wide.astype(np.float32)
+
+
+def sh_functions(degree: int, directions: np.ndarray) -> np.ndarray:
+    """[K, n] f64, SH functions above degree 0 in unit directions ([3, n]), in the order of INRIA's coefficients."""
+    x, y, z = np.asarray(directions, np.float64)
+    xx, yy, zz = x * x, y * y, z * z
+    bands = (
+        (-SH_C1 * y, SH_C1 * z, -SH_C1 * x),
+        (x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy),
+        (
+            *(y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy)),
+            *(x * (4 * zz - xx - yy), z * (xx - yy), x * (xx - 3 * yy)),
+        ),
+        (
+            *(x * y * (xx - yy), y * z * (3 * xx - yy), x * y * (7 * zz - 1), y * z * (7 * zz - 3)),
+            *(zz * (35 * zz - 30) + 3, x * z * (7 * zz - 3), (xx - yy) * (7 * zz - 1), x * z * (xx - 3 * yy)),
+            xx * (xx - 3 * yy) - yy * (3 * xx - yy),
+        ),
+    )
+    factors = ((1.0,) * 3, SH_C2, SH_C3, SH_C4)
+    rows = [
+        factor * term
+        for band, constants in zip(bands[:degree], factors, strict=False)
+        for factor, term in zip(constants, band, strict=True)
+    ]
+    return np.stack(rows) if rows else np.zeros((0, len(x)))
+
+
+def band_matrices(turn: np.ndarray, degree: int = MAX_SH_DEGREE) -> list[np.ndarray]:
+    """Matrices that turn the coefficients of each band above degree 0.
+
+    A turned Gaussian shows in direction d what it showed in direction `turn`^T d before. We write both as functions of
+    many directions and solve for the coefficients; a band turns into itself, so that the solution is exact.
+
+    `turn`: [3, 3] f64, orthogonal; mirrors are allowed.
+
+    Returns [2 l + 1, 2 l + 1] f64 for l = 1 to `degree`: new coefficients from old ones.
+    """
+    directions = _spread(_DIRECTIONS)
+    before, after = sh_functions(degree, product(turn.T, directions)), sh_functions(degree, directions)
+    bands = [slice(sh_rest_count(band - 1), sh_rest_count(band)) for band in range(1, degree + 1)]
+    return [np.linalg.lstsq(after[band].T, before[band].T, rcond=None)[0].round(_DIGITS) for band in bands]
+
+
+def turn_sh(sh_rest: np.ndarray, matrices: list[np.ndarray]) -> np.ndarray:
+    """[3 K, n] f64, SH ([3 K, n], channel by channel) after the turn of `band_matrices`."""
+    channels = np.array(sh_rest, np.float64).reshape(3, len(sh_rest) // 3, sh_rest.shape[1])
+    start = 0
+    for matrix in matrices:
+        band = slice(start, start + len(matrix))
+        if band.stop > channels.shape[1]:
+            break
+        channels[:, band] = product(matrix, channels[:, band].swapaxes(0, 1)).swapaxes(0, 1)
+        start = band.stop
+    return channels.reshape(sh_rest.shape)
+
+
+def _spread(count: int) -> np.ndarray:
+    """[3, count] f64, unit directions along a spiral over the sphere."""
+    at = np.arange(count) + 0.5
+    z = 1 - 2 * at / count
+    angle = np.pi * (1 + np.sqrt(5)) * at
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z])

@@ -1,7 +1,11 @@
-"""The interface of scenes: metadata when opened, values by row range or row list, into arrays that the caller owns."""
+"""The interface of scenes: metadata when opened, values by row range or row list, into arrays that the caller owns.
+
+Sources that change what another one gives stand here too.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -26,6 +30,9 @@ cache."""
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
 """SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""
 SAMPLE_ROWS = 4096  # Most Gaussians whose positions tell which poses see which part of a scene, and how much of it
+GROWTH_POWER = 0.125
+"""Power by which scales grow with the number of rows that belong to a scene over those that are there:
+docs/results/tuning.md#layers"""
 
 
 class SceneSource(ABC):
@@ -218,7 +225,6 @@ class MemorySource(SceneSource):
         return sh_count
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`."""
         rows, planes = self.begin_read(rows, fields, out)
         if isinstance(rows, slice):
             copy_all_rows([(self._planes[field], plane) for field, plane in planes.items()], rows)
@@ -229,7 +235,7 @@ class MemorySource(SceneSource):
 
 
 class WrappedSource(SceneSource):
-    """Another source with other values: a subclass changes what it does not share with its parent."""
+    """Another source with other values: a subclass says what it does not share with its parent, and changes the values."""
 
     def __init__(self, parent: SceneSource, notes: tuple[str, ...] = ()) -> None:
         self.parent, self.notes = parent, (*parent.notes, *notes)
@@ -238,6 +244,14 @@ class WrappedSource(SceneSource):
         # Without comments: these values do not lie on the grid that they may name.
         self.settings, self.held_bytes = parent.settings, parent.held_bytes
         self.file_bytes, self.version, self.doubles = parent.file_bytes, parent.version, parent.doubles
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        planes = self.parent.read(rows, fields, out)
+        self.change(planes)
+        return planes
+
+    def change(self, planes: Planes) -> None:
+        """Change values that were read from the parent; by default, none."""
 
 
 class SelectSource(WrappedSource):
@@ -300,5 +314,58 @@ def by_chunk(rows: Rows, starts: np.ndarray) -> Iterator[tuple[int, Rows, slice]
 def some_positions(source: SceneSource, most: int = SAMPLE_ROWS) -> np.ndarray:
     """[3, n] f64, world coordinates of at most `most` rows, evenly spread over the scene's rows."""
     rows = np.arange(0, source.count, max(-(-source.count // most), 1))
-    positions: np.ndarray = source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
-    return positions
+    return source.read(rows, ["means"])["means"].astype(np.float64) + source.origin[:, None]
+
+
+def growth(there: int, whole: int) -> np.float32:
+    """What the log-scales of `there` rows (above 0) grow by when they stand for a scene of `whole` rows."""
+    return np.float32(GROWTH_POWER * math.log(whole / there))
+
+
+class GrownSource(WrappedSource):
+    """A part of a scene of `whole` rows, grown to stand for all of it."""
+
+    def __init__(self, parent: SceneSource, whole: int) -> None:
+        super().__init__(parent)
+        self._growth = growth(max(parent.count, 1), whole)
+
+    def change(self, planes: Planes) -> None:
+        if "log_scales" in planes:
+            planes["log_scales"] += self._growth
+
+
+class TrimmedSource(WrappedSource):
+    """A scene with SH up to a lower degree, and without SH where `keeps_sh` ([N] bool) is false."""
+
+    def __init__(self, parent: SceneSource, keeps_sh: np.ndarray, degree: int, notes: tuple[str, ...] = ()) -> None:
+        super().__init__(parent, notes)
+        self.keeps_sh, self.sh_degree = keeps_sh, min(degree, parent.sh_degree)
+        self.sh_count = parent.sh_count if self.sh_degree else 0
+
+    def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
+        rows, planes = self.begin_read(rows, fields, out)
+        self.parent.read(rows, [name for name in fields if name != "sh_rest"], planes)
+        if "sh_rest" in planes and self.sh_degree:
+            whole = self.parent.read(rows, ["sh_rest"])["sh_rest"] * self.keeps_sh[rows]
+            planes["sh_rest"][...] = lower_degree(whole, self.sh_degree)
+        return planes
+
+
+def without_degrees(source: SceneSource, most: int | None) -> SceneSource:
+    """`source` with SH up to degree `most`, and a note on what is left out; `source` itself if nothing is."""
+    if most is None or source.sh_degree <= most:
+        return source
+    note = f"SH above degree {most} left out (the file has degree {source.sh_degree})"
+    # Nobody asks which rows keep their SH if none does.
+    return TrimmedSource(source, np.ones(source.count if most else 0, bool), most, (note,))
+
+
+def lower_degree(sh_rest: np.ndarray, degree: int) -> np.ndarray:
+    """[3 K', n] SH up to `degree` from [3 K, n] SH. Both lie channel by channel.
+
+    >>> lower_degree(np.arange(24.0).reshape(24, 1), 1).ravel().tolist()
+    [0.0, 1.0, 2.0, 8.0, 9.0, 10.0, 16.0, 17.0, 18.0]
+    """
+    width, count = sh_rest.shape
+    channels = sh_rest.reshape(3, width // 3, count)[:, : sh_rest_count(degree)]
+    return np.ascontiguousarray(channels.reshape(3 * channels.shape[1], count))

@@ -1,7 +1,5 @@
 """`study rate`: bytes against quality of both methods, and of the whole scene in the formats of other programs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +21,19 @@ from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.options import NO_CAMERAS, CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Row, Table, columns, figures, number
-from flexgs_edge.studies.written import SceneStudy, Study, write_study
+from flexgs_edge.studies.written import (
+    FIGURES,
+    Cell,
+    Experiment,
+    Row,
+    SceneStudy,
+    Study,
+    Table,
+    columns,
+    figures,
+    number,
+    write_study,
+)
 
 RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PEERS = (".spz", ".sog", ".compressed.ply")  # Formats of other programs that the study compares with
@@ -62,9 +71,6 @@ def study_rate(
     """Measure bytes and quality of every method on a scene and write them to a folder.
 
     `ratios`: PLY bytes over file bytes.
-
-    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
-    written then.
     """
     options = replace(options or CompressOptions(), **words)
     bad = [value for value in ratios if not (math.isfinite(value) and value >= 1.0)]
@@ -163,10 +169,7 @@ class _Points:
 
 
 class Curve:
-    """Bytes and loss of one method at several sizes.
-
-    `points`: bytes and dB.
-    """
+    """Bytes and loss of one method at several sizes. `points`: bytes and dB."""
 
     def __init__(self, points: Iterable[tuple[float, float]]) -> None:
         known = sorted((size, loss) for size, loss in points if loss >= LEAST_LOSS)

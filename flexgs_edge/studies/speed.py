@@ -1,7 +1,5 @@
 """`study speed`: how much time each method and effort of `compress` takes, and the ratio that it finds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,18 @@ from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Table, columns, figures, number
-from flexgs_edge.studies.written import SceneStudy, Study, write_study
+from flexgs_edge.studies.written import (
+    FIGURES,
+    Cell,
+    Experiment,
+    SceneStudy,
+    Study,
+    Table,
+    columns,
+    figures,
+    number,
+    write_study,
+)
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
 
@@ -26,11 +34,7 @@ def study_speed(
     progress: Progress = SILENT,
     **words: Any,
 ) -> Study:
-    """Measure the time and the ratio of every preset on a scene and write them to a folder.
-
-    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
-    written then.
-    """
+    """Measure the time and the ratio of every preset on a scene and write them to a folder."""
     options = replace(options or CompressOptions(), **words)
     return write_study(
         "study speed",

@@ -1,7 +1,5 @@
 """`study stability`: where compressed scenes break, on held-out views and from poses beside them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +19,26 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.as_json import rounded
 from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.few_poses import evenly
+from flexgs_edge.run.few_poses import evenly, visible_depths
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.studies.result_tables import FIGURES, Cell, Experiment, Row, Table, columns, figures, number
-from flexgs_edge.studies.written import SceneStudy, Study, write_study
-from flexgs_edge.views.depths import visible_depths
+from flexgs_edge.studies.written import (
+    FIGURES,
+    Cell,
+    Experiment,
+    Row,
+    SceneStudy,
+    Study,
+    Table,
+    columns,
+    figures,
+    number,
+    write_study,
+)
 
 BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"
@@ -38,8 +46,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "best": {"method": "best"},
     "best, --promise mean": {"method": "best", "promise": "mean"},
     "paper": {"method": "paper"},
-}
-"""What is compared, and its options."""
+}  # What is compared, and its options
 EFFORT = "fast"  # Breaks show at every effort
 TILE_SIDE = 64
 TURNS = (15.0, 30.0)  # Degrees by which a pose is turned up about the point that it looks at
@@ -101,11 +108,7 @@ def study_stability(
     amounts: Amounts | None = None,
     **words: Any,
 ) -> Study:
-    """Find the conditions under which methods break on a scene, and write them to a folder.
-
-    Raises `FlexGSError`: `InputError` (also when matplotlib is missing), `DeviceError` or `BudgetError`. Nothing is
-    written then.
-    """
+    """Find the conditions under which methods break on a scene, and write them to a folder."""
     options = replace(options or CompressOptions(), **words)
     amounts = amounts or (QUICK if quick else FULL)
     if amounts.width is not None:
@@ -201,12 +204,11 @@ def make_poses(run: Run[CompressOptions], renderer: Renderer, amounts: Amounts) 
     made.append(Poses("between", None, [between(camera, other) for camera, other in zip(base, near)]))
     made += [Poses("above", turn, [above(c, depth, turn) for c, depth in zip(base, depths)]) for turn in TURNS]
     made += [Poses("focal length", f, [replace(c, fx=f * c.fx, fy=f * c.fy) for c in base]) for f in ZOOMS]
-    made += [Poses("resolution", f, [_sized(c, f) for c in base]) for f in SIZES]
+    for f in SIZES:
+        made.append(
+            Poses("resolution", f, [c.scaled(max(round(f * c.width), 1), max(round(f * c.height), 1)) for c in base])
+        )
     return made
-
-
-def _sized(camera: Camera, factor: float) -> Camera:
-    return camera.scaled(max(round(factor * camera.width), 1), max(round(factor * camera.height), 1))
 
 
 def worst_tile(image: np.ndarray, reference: np.ndarray, side: int = TILE_SIDE) -> float:

@@ -1,15 +1,14 @@
 """The files of the viewer (`web/`)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from flexgs_edge.errors import InputError
 
 PAGE = "viewer/index.html"
 STYLE = "viewer/style.css"
-ENTRIES = {"page": "viewer/src/page.js", "load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js"}
-"""The modules that are run: the page's, and those of the workers by the name that `startWorker` knows."""
+ENTRIES = {"load": "viewer/src/load-worker.js", "sort": "viewer/src/sort-worker.js", "page": "viewer/src/page.js"}
+"""The modules that are run: the page's, and those of the workers by the name that `startWorker` knows. In this order gzip makes
+most of them."""
 _PLAIN_WORKER = "viewer/src/plain-worker.js"
 LIVE = {**ENTRIES, "page": "viewer/src/live.js", "load": _PLAIN_WORKER}  # The same for the live scenes of a report
 ELEMENT = {**ENTRIES, "page": "viewer/src/element.js"}  # The same for the element that other pages hold
@@ -21,6 +20,9 @@ _KINDS = {
     SPATIAL: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
 }  # Of each kind, the worker that loads, and the module with the viewer
+_NOTES, _NO_NOTES = "viewer/src/notes.js", "viewer/src/no-notes.js"
+CROP = tuple(f"viewer/src/{name}.js" for name in ("crop", "in-picture", "styled", "vectors"))
+"""The module that a page loads when somebody opens what lies under "More", and those that it imports."""
 _FORMATS = "decoder/src/formats.js"
 _FORMATS_2 = "decoder/src/formats2.js"
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
@@ -40,11 +42,11 @@ def entries_of(kind: str) -> dict[str, str]:
     return {**ENTRIES, "load": _KINDS[kind][0]}
 
 
-def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
+def web_files(version: int = 1, kind: str = PLAIN, notes: bool = False) -> dict[str, str]:
     """Texts of all files that the viewer needs, by their path below `web/`.
 
     `version`: container version of the scene. A page of a scene of version 2 reads no other files, so that it is short;
-    one of a scene of version 1 reads both. `kind`: kind of the scene.
+    one of a scene of version 1 reads both. `kind`: kind of the scene. `notes`: whether the page may have any.
     """
     folder = web_folder()
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
@@ -52,6 +54,9 @@ def web_files(version: int = 1, kind: str = PLAIN) -> dict[str, str]:
     only_2 = files.pop(_FORMATS_2)
     if version == 2:
         files[_FORMATS] = only_2
+    without = files.pop(_NO_NOTES)
+    if not notes:
+        files[_NOTES] = without
     viewers = {name: files.pop(viewer) for name, (_, viewer) in _KINDS.items()}
     files[_KINDS[SPATIAL][1]] = viewers[kind]
     return files

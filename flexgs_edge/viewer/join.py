@@ -3,24 +3,25 @@
 Only the forms of `import` and `export` that our own modules use are understood; a test joins all of them.
 """
 
-from __future__ import annotations
-
 import posixpath
 import re
 from collections.abc import Mapping
 from importlib.util import find_spec
+
+from flexgs_edge.viewer.shaders import shorten_shader
 
 _SHADER = re.compile(r"`#version[^`]*`")
 _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
 _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
 _NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
+_NUMBER = re.compile(r"^const ([A-Z][A-Z0-9_]*) = (\d[0-9a-fx .*/<-]*);\n", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 
 
 def shorten_script(text: str) -> str:
     """A script of JavaScript that does the same; shaders in it lose comments and spaces."""
-    return _shorten("application/javascript", _SHADER.sub(lambda found: _shorten_shader(found[0]), text))
+    return _shorten("application/javascript", _SHADER.sub(lambda found: shorten_shader(found[0]), text))
 
 
 def shorten_style(text: str) -> str:
@@ -35,12 +36,6 @@ def _shorten(kind: str, text: str) -> str:
     import minify  # a runtime of its own, which only pages need
 
     return str(minify.string(kind, text))
-
-
-def _shorten_shader(text: str) -> str:
-    """Without comments, indentation and spaces beside signs; not beside + and -, two of which would become another sign."""
-    lines = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
-    return re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", lines)
 
 
 def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
@@ -61,7 +56,17 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
     chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
     own = "const ownScript = () => `(${joined})()`;"
+    body = _with_numbers(body)
     return shorten_script(f"(function joined() {{\n'use strict';\n{own}\n{body}\n{chosen}\n}})();") + "\n"
+
+
+def _with_numbers(text: str) -> str:
+    """Numbers in the place of their names, which the minifier would keep. No string of ours may hold such a name."""
+    numbers = dict(_NUMBER.findall(text))
+    text = _NUMBER.sub("", text)
+    for name, number in numbers.items():
+        text = re.sub(rf"(?<![\w.]){name}\b", f"({number})", text)
+    return text
 
 
 def _add(files: Mapping[str, str], path: str, parts: dict[str, str]) -> None:

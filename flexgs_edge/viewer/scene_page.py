@@ -1,7 +1,5 @@
 """The viewer's page for one scene, which lies beside it on a server or inside it."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -18,7 +16,8 @@ _CONFIG = '<script type="application/json" id="scene">{}</script>'
 _STYLE_LINK = '<link rel="stylesheet" href="style.css">'
 _SCRIPT = re.compile(r'<script type="module" src="src/page.js".*?</script>')
 _CANVAS = '<canvas id="canvas"'
-POSTER, ELEMENT_SCRIPT = "poster.jpg", "flexgs-scene.js"
+POSTER, ELEMENT_SCRIPT, NOTES_FILE = "poster.jpg", "flexgs-scene.js", "notes.json"
+NOTES, COMMAND = "notes", "command"  # Names in what the page is told: of the notes, and of the words that crop the file
 EMBED = """Upload this folder to any web server. To show the scene in a page of yours, put one of these into it, with the address
 of the folder:
 
@@ -28,8 +27,8 @@ of the folder:
 <script src="https://example.org/folder/flexgs-scene.js"></script>
 <flexgs-scene src="https://example.org/folder/scene.fgs" poster="https://example.org/folder/poster.jpg" turn="10"></flexgs-scene>
 
-The element also takes view="..." and controls="none"; it tells first, loaded and failed. The page takes ?view= and ?turn=
-after its address. "Copy a link to this view" in the page's panel makes a view.
+The element also takes view="...", notes="notes.json" and controls="none"; it tells first, loaded and failed. The page takes
+?view= and ?turn= after its address. "Copy a link to this view" in the page's panel makes a view.
 The server must not compress scene.fgs on the way. It should answer ranges of bytes; large scenes then load what is in sight.
 If your page is on another server than the folder, that server has to allow it (Access-Control-Allow-Origin).
 """
@@ -37,14 +36,20 @@ _CHARSET = '<meta charset="utf-8">'
 
 
 def page_config(
-    name: str, cameras: Sequence[Camera], look: Mapping[str, Any], scene: str | None = None
+    name: str,
+    cameras: Sequence[Camera],
+    look: Mapping[str, Any],
+    scene: str | None = None,
+    notes: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """What the page is told of its scene.
 
     `name`: shown on the page. `cameras`: the poses to choose from. `look`: how it is drawn: `near`, `background`,
-    `antialiased`. `scene`: address of the file; left out if its bytes lie in the page.
+    `antialiased`. `scene`: address of the file; left out if its bytes lie in the page. `notes`: from `read_notes`.
     """
-    config = {"name": name, "poses": [_pose(camera) for camera in cameras], "look": dict(look)}
+    config: dict[str, Any] = {"name": name, "poses": [_pose(camera) for camera in cameras], "look": dict(look)}
+    if notes:
+        config[NOTES] = list(notes)
     return config if scene is None else {**config, "scene": scene}
 
 
@@ -92,6 +97,8 @@ def viewer_page(
     changes = {tag: made, _STYLE_LINK: f"<style>{style}</style>", _CONFIG: _config(config)}
     if scene is None:
         policy += "; connect-src 'self'"
+        if COMMAND in config:  # the box to crop by comes when it is asked for
+            policy = policy.replace(" blob:;", " blob: 'self';", 1)
     else:
         changes[_CHARSET] = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
         data = base64.b64encode(scene).decode()
@@ -105,14 +112,17 @@ def site_files(version: int, config: Mapping[str, Any], kind: str, poster: bytes
     `version`, `kind`: of the scene's file. `config`: from `page_config`; it names the scene. `poster`: a JPEG of the first
     view, which is shown until the scene is.
     """
-    made = viewer_page(web_files(version, kind), config, kind=kind)
+    notes = config.get(NOTES)
+    made = viewer_page(web_files(version, kind, bool(notes)), config, kind=kind)
     policy = made.policy.replace("img-src ", "img-src 'self' ")
     head = f'{_CHARSET}\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
     changes = {_CHARSET: head}
     if poster is not None:
         changes[_CANVAS] = f'<img id="poster" src="{POSTER}" alt="">\n{_CANVAS}'
     site = {"index.html": _replaced(made.text, changes).encode(), "embed.txt": EMBED.encode()}
-    site[ELEMENT_SCRIPT] = join_modules(web_files(version, SPATIAL), ELEMENT).encode()
+    site[ELEMENT_SCRIPT] = join_modules(web_files(version, SPATIAL, notes=True), ELEMENT).encode()
+    if notes:
+        site[NOTES_FILE] = json.dumps(notes, indent=1).encode()
     return site if poster is None else {**site, POSTER: poster}
 
 

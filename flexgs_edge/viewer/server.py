@@ -5,8 +5,6 @@ random, and the `Host` of a request has to be ours: other pages in the browser c
 a name of their own.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re
@@ -277,6 +275,3 @@ def _part(asked: str | None, size: int) -> tuple[int, int] | None:
     if start >= size or (found[1] and found[2] and int(found[2]) < start):
         raise _Refused(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, Content_Range=f"bytes */{size}")
     return start, stop
-
-
-__all__ = ["Resource", "SceneServer"]

@@ -1,12 +1,11 @@
-"""Renders of the original model, the targets of fine-tuning in place of photos.
-
-A scratch file holds them in half precision.
-"""
+"""Renders of the original model, the targets of fine-tuning in place of photos: a scratch file holds them in half precision."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,10 @@ HALF_LARGEST = float(np.finfo(np.float16).max)
 
 def to_half(values: np.ndarray) -> np.ndarray:
     """Round to half precision, clipped to its range: an infinity would become NaN in every sum."""
-    half: np.ndarray = np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
-    return half
+    return np.clip(values, -HALF_LARGEST, HALF_LARGEST).astype(np.float16)
 
 
-class References:
+class References(AbstractContextManager["References"]):
     """Renders of one scene from some cameras, in the layout that `Renderer.residual_sums` takes.
 
     Half precision (11 bits) is finer than the 8 bits that viewers show. We read the file with plain reads, since the
@@ -84,8 +82,28 @@ class References:
         """Remove the scratch file."""
         self._file.close()
 
-    def __enter__(self) -> References:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+@dataclass(frozen=True)
+class Original:
+    """The original from some poses."""
+
+    renderer: Renderer  # draws the views
+    origin: np.ndarray  # [3] f64, as in `SceneSource`
+    cameras: Sequence[Camera]  # scored poses
+    references: References  # renders of the original from `cameras`, then from `between`
+    # Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between
+    # them.
+    between: Sequence[Camera] = ()
+    progress: Progress = SILENT  # told of each view
+    steps: int = 0  # steps of the descent to the first candidate; 0 (default): colours are refitted instead
+    # [n] f64, above 0: how often a descent looks at each of `poses`, relative to the others. Default: alike.
+    turns: np.ndarray | None = None
+    depth: float = 1.0  # usual distance of the poses to what they look at, scene units: positions move by a share of it
+
+    @property
+    def poses(self) -> list[Camera]:
+        """All poses, in the order of their references."""
+        return [*self.cameras, *self.between]

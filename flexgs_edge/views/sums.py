@@ -5,8 +5,6 @@ sums to a file: only rows with a sum other than zero, at most 52 bytes each. Lat
 hold the sums of one chunk at a time. Both ways add the same numbers in the same order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, BinaryIO, Protocol
@@ -21,7 +19,30 @@ from flexgs_edge.render.chunks import Chunk, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import padded
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.views.one_view import Part, view_parts, view_sums
+
+SPOOL_ROWS = 1 << 16  # Rows of a view that are copied from the backend at a time
+Part = tuple[np.ndarray, np.ndarray]  # Rows of a scene ([m] u32, ascending) and their sums ([m, planes] i64)
+
+
+def view_sums(renderer: Renderer, scene: DeviceScene, kind: str, camera: Camera, target: np.ndarray | None) -> Any:
+    """The sums of one view by the method of `Renderer` with the name `kind`; some methods need a target."""
+    draw: Callable[..., Any] = getattr(renderer, kind)
+    return draw(scene, camera) if target is None else draw(scene, camera, target)
+
+
+def view_parts(renderer: Renderer, scene: DeviceScene, sums: Any) -> Iterator[Part]:
+    """Yield the rows with a sum other than zero in the last view, in row order, part by part."""
+    of_view, planes = renderer.view_rows, sums.shape[1]
+    count = scene.count if of_view is None else len(of_view)
+    for at in range(0, count, SPOOL_ROWS):
+        words = np.empty((min(SPOOL_ROWS, count - at), planes, 2), np.uint32)
+        values = renderer.backend.read(sums, words, 2 * planes * at).view(np.int64)[..., 0]
+        got = values[:, 0].copy()
+        for plane in range(1, planes):  # much faster than `values.any(axis=1)`
+            got |= values[:, plane]
+        some = np.flatnonzero(got)
+        rows = at + some if of_view is None else of_view[at + some]
+        yield rows.astype(np.uint32), values.take(some, axis=0)
 
 
 class DenseSums:
@@ -144,10 +165,7 @@ Maker = Callable[[Chunk], ChunkSums]
 
 
 class ViewSums:
-    """Sums over the views of a scene.
-
-    `renderer`: draws the views. `makers`: each makes one kind of sums for a chunk.
-    """
+    """Sums over the views of a scene. `renderer`: draws the views. `makers`: each makes one kind of sums for a chunk."""
 
     def __init__(self, renderer: Renderer, scene: DeviceScene, makers: Sequence[Maker]) -> None:
         self._renderer, self._scene, self._makers = renderer, scene, makers
@@ -175,7 +193,9 @@ class ViewSums:
         """Add the sums of the last view, from `camera`. The order of views is part of the result."""
         parts = self._renderer.parts
         if parts is None:
-            self._add_parts(view_parts(self._renderer, self._scene, sums), camera)
+            if self._spool is None:
+                self._spool = Spool(self._renderer.storage, self._scene.starts)
+            self._spool.add(view_parts(self._renderer, self._scene, sums), camera)
             return
         for chunk, held in self._chunks():
             if parts[chunk.base].count:
@@ -188,11 +208,6 @@ class ViewSums:
             if chunk.base not in self._held:
                 self._held[chunk.base] = (chunk.count, [make(chunk) for make in self._makers])
             yield chunk, self._held[chunk.base][1]
-
-    def _add_parts(self, parts: Iterable[Part], camera: Camera) -> None:
-        if self._spool is None:
-            self._spool = Spool(self._renderer.storage, self._scene.starts)
-        self._spool.add(parts, camera)
 
     def parts(self) -> Iterator[tuple[slice, list[Any]]]:
         """Yield rows of the scene and their sums over all views, one of each kind, chunk by chunk.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -299,9 +299,9 @@ def test_the_words_are_those_of_the_options() -> None:
         "cameras",
         "images",
     }
-    words = {field.name: field.type for field in fields(CompressOptions)}
-    for name, kind in CompressWords.__annotations__.items():
-        assert getattr(kind, "__forward_arg__", kind) == words[name], name
+    words = get_type_hints(CompressOptions)
+    for name, kind in get_type_hints(CompressWords).items():
+        assert kind == words[name], name
 
 
 def test_every_result_has_its_summary_and_its_json(coded: dict[str, tuple[Path, bytes]], project: Path) -> None:

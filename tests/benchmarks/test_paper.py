@@ -17,15 +17,15 @@ from benchmarks.paper.charts import PlaneChart
 from benchmarks.paper.scene import Setting, StudyScene, open_study_scene
 from benchmarks.paper.study import study_paper
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.codec.v1.header import container_size
+from flexgs_edge.codec.v1.container import container_size
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.goals.target import MaxDrop
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.paper.prune import ranks_from_order, select_rows
 from flexgs_edge.methods.paper.search import CANDIDATES, adapt
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.packed.quantize import dequantize, quantize_scene
 from flexgs_edge.progress import SILENT
 from flexgs_edge.render.renderer import Renderer

@@ -13,14 +13,14 @@ from camera_files import write_inria
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import PlySource, write_ply
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.rotations import turned
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from scene_files import open_scene
 from synthetic import make_camera, random_scene
 
 ALL = [field.name for field in FIELDS]

@@ -13,9 +13,9 @@ from camera_files import colmap_records, write_colmap, write_inria, write_transf
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.source import SceneSource
 from kernel_fixtures import large_budget, open_form
+from scene_files import open_scene
 from synthetic import look_from, make_camera, random_scene
 
 KINDS = ("inria", "text", "binary", "transforms")

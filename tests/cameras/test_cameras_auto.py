@@ -23,9 +23,9 @@ from flexgs_edge.cameras.scene_sample import sh_basis, weighted_quantiles
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.ply import PlySource
+from flexgs_edge.methods.paper.method import score_scene
 from flexgs_edge.methods.paper.prune import nonzero_sh, order_from_scores, ranks_from_order, select_rows
-from flexgs_edge.methods.paper.scores import score_scene
-from flexgs_edge.packed.bitspec import PAPER
+from flexgs_edge.packed.bitpack import PAPER
 from flexgs_edge.packed.quantize import quantize_scene, quantized_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD, sh_rest_count

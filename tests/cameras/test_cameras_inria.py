@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexgs_edge.cameras.read import read_cameras, read_inria
+from camera_files import read_inria
+from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.errors import FormatError, InputError
 
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]

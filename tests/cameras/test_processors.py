@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera_files import read_inria
 from flexgs_edge.cameras.generated import at_distance, poses_between
 from flexgs_edge.cameras.order import covering_order
-from flexgs_edge.cameras.read import read_inria
 from flexgs_edge.render.ahead import camera_record
 
 PROCESSORS = {

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from camera_files import colmap_records, transforms_of, write_colmap, write_inria, write_transforms
+from camera_files import colmap_records, read_transforms, transforms_of, write_colmap, write_inria, write_transforms
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cameras.transforms import read_transforms
 from flexgs_edge.errors import FormatError, InputError
 from synthetic import look_from, make_camera
 

@@ -21,8 +21,7 @@ from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError, InputError, TargetError
 from flexgs_edge.goals.steps import REFINE_STEPS
 from flexgs_edge.methods.best.effort import EFFORTS
-from flexgs_edge.methods.paper.scores import SCORES
-from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SELECTS, CompressOptions, ViewOptions
+from flexgs_edge.run.options import EFFORT_WORDS, METHODS, SCORES, SELECTS, CompressOptions, ViewOptions
 from interruptible import running
 from tiny_project import COUNT, make_project
 
@@ -62,6 +61,14 @@ def spawn(*arguments: object, **kwargs: object) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, env=env, timeout=120, check=False, **kwargs)  # type: ignore[call-overload]
 
 
+def subcommand(name: str) -> click.Command:
+    """A subcommand of `flexgs-edge`."""
+    group = importlib.import_module("flexgs_edge.cli.app").command
+    found = group.get_command(click.Context(group), name)
+    assert isinstance(found, click.Command)
+    return found
+
+
 def test_version_and_help() -> None:
     version = spawn("--version")
     assert version.returncode == 0 and version.stdout == "flexgs-edge 0.1.0\n"
@@ -74,14 +81,14 @@ def test_version_and_help() -> None:
 def test_help_of_every_command_teaches(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, text, _ = run(name, "--help", capsys=capsys)
     assert code == 0 and "Examples:" in text and f"flexgs-edge {name}" in text
-    command = importlib.import_module(f"flexgs_edge.cli.{name}").command
+    command = subcommand(name)
     options = [parameter for parameter in command.params if isinstance(parameter, click.Option)]
     assert all(option.help and option.help.endswith(".") for option in options), [o.name for o in options]
     assert "Show this message and exit." in text
 
 
 def test_words_of_the_options_are_those_of_the_library() -> None:
-    command = importlib.import_module("flexgs_edge.cli.compress").command
+    command = subcommand("compress")
     given = {parameter.name: parameter for parameter in command.params}
     fields = set(CompressOptions.__dataclass_fields__)
     assert fields <= set(given), fields - set(given)
@@ -95,7 +102,7 @@ def test_words_of_the_options_are_those_of_the_library() -> None:
         plain = None if default in (None, False) or "UNSET" in str(default).upper() else default
         assert plain == (getattr(defaults, name) or None), name
     for name in ("render", "evaluate"):
-        found = {p.name for p in importlib.import_module(f"flexgs_edge.cli.{name}").command.params}
+        found = {p.name for p in subcommand(name).params}
         assert set(ViewOptions.__dataclass_fields__) - found <= {"images", "holdout", "exposure"}
 
 
@@ -105,7 +112,7 @@ def test_the_examples_of_help_and_readme_make_sense() -> None:
     shown = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "flexgs_edge" / "cli").glob("*.py")]
     lines = [line.strip() for path in shown for line in path.read_text().splitlines()]
     examples = [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("flexgs-edge compress ")]
-    command = importlib.import_module("flexgs_edge.cli.compress").command
+    command = subcommand("compress")
     assert len(examples) > 15
     for example in examples:
         with command.make_context("compress", list(example)) as context:

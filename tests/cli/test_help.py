@@ -76,7 +76,7 @@ def test_the_first_page_of_compress_is_short(
 def test_every_option_of_compress_is_on_a_page(capsys: pytest.CaptureFixture[str]) -> None:
     first = names(page("compress", "--help", capsys=capsys))
     everything = names(page("compress", "--expert", capsys=capsys))
-    assert first < everything and everything | set(HIDDEN) == accepted(compress.command) and len(HIDDEN) <= 5
+    assert first < everything and everything | set(HIDDEN) == accepted(compress.compress) and len(HIDDEN) <= 5
     # An eager flag: nothing else has to be right.
     assert page("compress", "--max-drop", "1", "--expert", capsys=capsys).startswith("Usage: ")
 
@@ -105,16 +105,16 @@ def test_a_figure_would_be_found() -> None:
 def test_the_sections_of_methods_are_those_of_the_library(capsys: pytest.CaptureFixture[str]) -> None:
     """Under a method's heading, or with a heading of its own and named below the method's."""
     text = page("compress", "--expert", capsys=capsys)
-    with click.Context(compress.command) as context:
+    with click.Context(compress.compress) as context:
         context.meta["flexgs_edge.expert"] = True
-        sections = compress.command.sections(context)
+        sections = compress.compress.sections(context)
     owners = {
         parameter: heading for heading, options in sections.items() for parameter in (each.name for each in options)
     }
     for method in ("best", "paper"):
         members = {name for name, (owner, _) in METHOD_ONLY.items() if owner == method}
         below = {name for name, heading in owners.items() if heading == f"{METHOD} {method}"}
-        note = compress.command.note(f"{METHOD} {method}")
+        note = compress.compress.note(f"{METHOD} {method}")
         assert note in " ".join(text.split())
         named = {word.strip(".,").removeprefix("--").replace("-", "_") for word in note.split() if word[:2] == "--"}
         assert below | (named - {"method"}) == members and not below & named

@@ -20,8 +20,8 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import RUB, FrameSource
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.run.inputs import load_scene
+from flexgs_edge.run.run import frame_warnings
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.run.warnings import frame_warnings
 from synthetic import make_camera
 from tiny_project import COUNT, make_project
 

@@ -15,10 +15,10 @@ from flexgs_edge.commands.info import info
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from scene_files import open_scene
 from stopped import Stopped
 from tiny_project import COUNT, FAST, compress_project, make_project, write_cameras
 

@@ -17,7 +17,7 @@ from flexgs_edge.commands.compress_all import compress_all
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.progress import Progress, T
-from flexgs_edge.report.batch_result import BatchResult
+from flexgs_edge.report.results import BatchResult
 from flexgs_edge.scene.source import SceneSource
 from synthetic import random_scene
 from tiny_project import write_cameras

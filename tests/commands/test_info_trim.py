@@ -26,10 +26,10 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.run.inputs import load_scene
-from flexgs_edge.run.open_scene import open_scene
-from flexgs_edge.scene.growth import GrownSource
+from flexgs_edge.scene.source import GrownSource
 from grid_scenes import make_grid
 from quantized_scenes import make_scene, quantize_all
+from scene_files import open_scene
 from synthetic import look_from, make_camera
 
 SETTINGS = {"source_count": 4000, "source_sh_degree": 2, "target": "drop <= 1 dB"}

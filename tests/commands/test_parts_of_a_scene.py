@@ -14,8 +14,8 @@ from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.run.background import contrasting_background
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.view_set import contrasting_background
 from flexgs_edge.scene.source import MemorySource
 from synthetic import joined, make_splats
 

@@ -17,10 +17,10 @@ from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.io.formats import FORMATS, WRITTEN
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
+from scene_files import open_scene
 from synthetic import look_from, make_camera, random_scene
 
 FAST: dict[str, Any] = {"effort": "fast", "holdout": 4}

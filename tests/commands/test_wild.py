@@ -13,11 +13,11 @@ from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.info import info
 from flexgs_edge.errors import FlexGSError
 from flexgs_edge.io.formats import FORMATS, WRITTEN
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.fields import FIELD
+from scene_files import open_scene
 
 PLAIN = [suffix for suffix in WRITTEN if not FORMATS[suffix].needs]
 """Formats that the plain install writes."""

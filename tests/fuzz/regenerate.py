@@ -27,7 +27,7 @@ from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.io.exchange import write_foreign
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from gltf_files import GltfBuilder, splat_arrays
 from grid_scenes import make_grid
 from ksplat_files import Part, ksplat

@@ -23,5 +23,5 @@ def test_next_points() -> None:
     assert next_point([(2.0, 3.0), (1.0, -1.0)], 1.0, 1.0) == pytest.approx(1 + 0.99 / 4)
     assert next_point([(1.0, -0.001), (2.0, 3.0)], 1.0, 1.0) == pytest.approx(1.1)
     # Two points on one side: by their own slope, but by no less than a share of the slope given.
-    assert next_point([(0.0, -0.5), (1.0, -0.49)], 1.0, 10.0) == pytest.approx(1 + 0.48 / 0.2)
+    assert next_point([(0.0, -0.5), (1.0, -0.49)], 1.0, 10.0) == pytest.approx(1 + 0.48 / 0.5)
     assert next_point([(0.0, -0.5), (1.0, -0.6)], 1.0, 10.0, 0.5) == pytest.approx(1 + 0.59 / 0.5)

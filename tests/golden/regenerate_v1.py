@@ -12,7 +12,7 @@ import numpy as np
 
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.packed.quantize import quantize_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource, SceneSource

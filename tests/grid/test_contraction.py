@@ -12,8 +12,8 @@ import pytest
 import educational_decoder
 import educational_decoder2
 from benchmarks.quantize import dequantized
-from flexgs_edge.codec.header import HeaderError, checked_contraction
 from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.codec.sections import HeaderError, checked_contraction
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
@@ -21,7 +21,7 @@ from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes, position_grid
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.grid.values import from_grid
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantize_scene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.contraction import LARGEST, Contraction, densest

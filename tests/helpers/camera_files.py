@@ -11,10 +11,23 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.json_values import load_json
+from flexgs_edge.cameras.read import cameras_of_list
+from flexgs_edge.cameras.transforms import cameras_of_frames
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FOV": 7}
 Lens = tuple[int, str, int, int, Sequence[float]]
 Image = tuple[int, Sequence[float], Sequence[float], int, str]
+
+
+def read_inria(path: Path | str) -> list[Camera]:
+    """The cameras of INRIA's cameras.json in the file's order."""
+    return cameras_of_list(Path(path), load_json(Path(path)))
+
+
+def read_transforms(path: Path | str, ignore_distortion: bool = False, dataparser: Path | None = None) -> list[Camera]:
+    """The cameras of a transforms.json in the file's order."""
+    return cameras_of_frames(Path(path), load_json(Path(path)), ignore_distortion, dataparser)
 
 
 def quaternion(rotation: np.ndarray) -> list[float]:

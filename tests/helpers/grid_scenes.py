@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.codec.v2.container import write_grid
+from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.ply import PlySource
+from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELDS
 
 STEPS = StepSizes(0.05, 0.25, 0.05, 0.4, 0.1, (0.2, 0.25, 0.3, 0.3))
@@ -40,6 +45,26 @@ def sample_grid(sample_dir: Path, thinned: int) -> GridScene:
     count = planes["means"].shape[1]
     degrees, layer = np.full(count, source.sh_degree), np.arange(count) % 2
     return to_grid(planes, degrees, FINE, tuple(source.origin), layer)[0]
+
+
+def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:
+    """The same scene behind a preview of every eighth row without SH, and that preview."""
+    source = open_fgs(scene)
+    assert isinstance(source, GridSource)
+    grid = source.grid()
+    some = grid.take(np.arange(0, grid.count, 8))
+    nothing = np.zeros_like(some.sh_degrees)
+    steps = replace(some.step_sizes, sh=())
+    flat = replace(some, sh_degree=0, sh_degrees=nothing, sh=(), step_sizes=steps, layer=nothing)
+    order = np.argsort(_cells_of_one_layer(flat), kind="stable")
+    small, place = folder / "small.fgs", folder / "still_life.fgs"
+    write_grid(small, flat.take(order), {})
+    write_grid(place, grid, {}, chunk_rows=chunk_rows, preview=small.read_bytes())
+    return place, small
+
+
+def _cells_of_one_layer(grid: GridScene) -> np.ndarray:
+    return morton(grid.position.astype(np.int64) - grid.position.min(axis=1)[:, None])
 
 
 def assert_same_grid(one: GridScene, two: GridScene) -> None:

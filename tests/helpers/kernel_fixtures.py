@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.harness import read_sums
 from flexgs_edge.cameras.auto import Drawing
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend, TwinBackend
-from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
-from flexgs_edge.kernels.form import Form
+from flexgs_edge.kernels.choose_device import DeviceInfo, Form, choose_device, list_devices
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
+from flexgs_edge.run.view_set import sketch
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.views.sketch import sketch
 
 FORMS = ("w16", "w8", "w4", "w1", "gpu", "gpu4")
 """Forms of the OpenCL kernels: vector widths of the CPU form; the GPU form, and that with four pixels a work-item."""
@@ -93,7 +93,7 @@ def removal_costs(
     """Squared error of removing each row, and its sum of squared weights, in one view ([N] i64, units of 1 / FIXED_ERROR)."""
     renderer = Renderer(backend, large_budget(), background=background, antialiased=antialiased)
     with renderer.load(source) as scene:
-        errors, weights = renderer.read_sums(renderer.removal_sums(scene, camera), 2, source.count)
+        errors, weights = read_sums(renderer, renderer.removal_sums(scene, camera), 2, source.count)
     renderer.release()
     return errors, weights
 
@@ -102,7 +102,7 @@ def residual_sums(backend: Backend, source: SceneSource, camera: Camera, target:
     """Weights, and weighted residual of red, green and blue ([4, N] i64, units of 1 / FIXED_WEIGHT) against [3, H, W] f16."""
     renderer = Renderer(backend, large_budget())
     with renderer.load(source) as scene:
-        sums = renderer.read_sums(renderer.residual_sums(scene, camera, target), 4, source.count)
+        sums = read_sums(renderer, renderer.residual_sums(scene, camera, target), 4, source.count)
     renderer.release()
     return sums
 

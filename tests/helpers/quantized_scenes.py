@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.methods.paper.prune import nonzero_sh
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.packed.quantize import SMALLEST_STEP, QuantizedArray, QuantizedScene, _quantize_stream, quantize_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.run.open_scene import open_file
+from flexgs_edge.scene.source import SceneSource
+
 REST = {0: 0, 1: 9, 2: 24, 3: 45, 4: 72}
 TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
@@ -56,3 +60,8 @@ def edit(data: bytes, old: str, new: str) -> bytes:
     """`data` with one piece of text replaced; it must be there."""
     assert old.encode() in data
     return data.replace(old.encode(), new.encode(), 1)
+
+
+def open_scene(path: str | Path, reading: Reading = AS_WRITTEN) -> SceneSource:
+    """The values of a scene file, with its axes in RDF."""
+    return open_file(path, reading).source

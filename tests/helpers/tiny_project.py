@@ -12,11 +12,11 @@ from benchmarks.camera_files import inria_json
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.open_scene import open_scene
+from scene_files import open_scene
 from synthetic import look_from, make_camera, random_scene
 
 COUNT, VIEWS, WIDTH, HEIGHT = 400, 9, 40, 30

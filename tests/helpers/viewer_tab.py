@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from browser import Browser
+from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.commands.view import view
 from flexgs_edge.viewer.assets import PAGE
 from flexgs_edge.viewer.server import SceneServer
@@ -112,6 +113,13 @@ def faults(tab: Tab) -> list[str]:
     found = [event for event in tab.events if event.get("method") in names]
     # A request that the page itself has given up is none.
     return [json.dumps(event)[:500] for event in found if not event["params"].get("canceled")]
+
+
+def pose_of(camera: Camera) -> dict[str, Any]:
+    """A camera, for a page."""
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    numbers = {name: getattr(camera, name) for name in names}
+    return {"rotation": camera.rotation.tolist(), "position": camera.center.tolist(), **numbers}
 
 
 def decibels(one: np.ndarray, two: np.ndarray) -> float:

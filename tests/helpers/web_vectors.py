@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.codec.v1.container import write_container
-from flexgs_edge.codec.v1.header import CHUNK_ROWS
+from flexgs_edge.codec.v1.container import CHUNK_ROWS, write_container
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.grid.grid_scene import GridScene, row_places
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELD

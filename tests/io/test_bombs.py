@@ -18,8 +18,8 @@ import zstandard
 from flexgs_edge.errors import BudgetError, FormatError
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
+from scene_files import open_scene
 from sog_files import coded, entry, meta_of, random_pictures, write_folder, zipped
 
 ROWS = 1 << 20

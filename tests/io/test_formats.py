@@ -23,10 +23,10 @@ from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.io.reading import Reading, Writing
 from flexgs_edge.quality.psnr import mse, psnr
 from flexgs_edge.run.inputs import load_scene
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.rotations import matrices
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from scene_files import open_scene
 
 pytestmark = pytest.mark.usefixtures("own_temporary_folder")
 

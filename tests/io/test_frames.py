@@ -12,7 +12,7 @@ from flexgs_edge.cameras.scene_sample import sh_basis
 from flexgs_edge.constants import SH_C4
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.frames import LUF, RDF, RUB, Frame, FrameSource, in_frame
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELDS

@@ -11,9 +11,8 @@ from flexgs_edge.io.gltf import read_gltf
 from flexgs_edge.io.reading import AS_WRITTEN
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.rotations import matrices
+from flexgs_edge.scene.rotations import matrices, sh_functions
 from flexgs_edge.scene.source import Planes, SceneSource
-from flexgs_edge.scene.turn_sh import sh_functions
 from gltf_files import GltfBuilder, splat_arrays
 
 ARRAYS = splat_arrays(20, 3)

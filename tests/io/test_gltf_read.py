@@ -12,11 +12,11 @@ import pytest
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.exchange import read_foreign
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import Planes, Rows
 from gltf_files import EXTENSION, GltfBuilder, own, planes, splat_arrays
+from scene_files import open_scene
 
 
 @pytest.fixture

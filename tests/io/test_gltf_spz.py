@@ -9,8 +9,8 @@ import pytest
 
 from flexgs_edge.io.decoded import DecodedSource
 from flexgs_edge.io.frames import RUB, Frame
-from flexgs_edge.io.gltf import splats_of
-from flexgs_edge.io.gltf_container import GltfFile
+from flexgs_edge.io.gltf import read_gltf
+from flexgs_edge.io.reading import AS_WRITTEN
 from flexgs_edge.scene.source import Rows
 from gltf_files import EXTENSION, GltfBuilder, own, planes, splat_arrays
 
@@ -66,6 +66,7 @@ def test_spz_is_turned_to_gltfs_axes(
     bounds: list[list[float]] | None,
     frame: Frame | None,
     signs: tuple[int, int, int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     spz_file(builder, bounds, place)
     path = builder.glb(tmp_path / "a.glb")
@@ -75,7 +76,8 @@ def test_spz_is_turned_to_gltfs_axes(
         seen.append((data, name))
         return Spz(data, name, frame, antialiased=True)
 
-    source = splats_of(GltfFile(path, "user.glb"), unpack)
+    monkeypatch.setattr("flexgs_edge.io.spz.spz_source", unpack)
+    source = read_gltf(path, "user.glb", AS_WRITTEN)
     assert seen == [(b"SPZ bytes", "user.glb: meshes[0].primitives[0]: the .spz in bufferViews[0]")]
     assert (source.count, source.sh_degree, dict(source.settings)) == (3, 1, {"antialiased": True})
     raw = Spz(b"", "")
@@ -88,12 +90,11 @@ def test_spz_is_turned_to_gltfs_axes(
     np.testing.assert_allclose(planes(source)["sh_rest"], raw.decode(slice(0, 3), "sh_rest") * odd)
 
 
-def test_marks_of_some_parts_are_a_note(builder: GltfBuilder, tmp_path: Path) -> None:
+def test_marks_of_some_parts_are_a_note(builder: GltfBuilder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spz_file(builder, None)
     builder.splats(splat_arrays(2))
-    source = splats_of(
-        GltfFile(builder.glb(tmp_path / "a.glb"), "a.glb"), lambda data, name: Spz(data, name, None, True)
-    )
+    monkeypatch.setattr("flexgs_edge.io.spz.spz_source", lambda data, name: Spz(data, name, None, True))
+    source = read_gltf(builder.glb(tmp_path / "a.glb"), "a.glb", AS_WRITTEN)
     assert (source.count, dict(source.settings)) == (5, {})
     assert source.notes[-1].startswith("some parts say that they are antialiased")
 

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import BudgetError, FormatError, InputError
-from flexgs_edge.io.gzipped import MOST_TIMES, SMALL, unpacked
 from flexgs_edge.io.ply import PlySource
-from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.open_scene import MOST_TIMES, SMALL, unpacked
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import SceneSource
-from scene_files import random_rows, write_rows
+from scene_files import open_scene, random_rows, write_rows
 
 ALL = [field.name for field in FIELDS]
 

@@ -17,8 +17,7 @@ import pytest
 
 from camera_files import colmap_records, images_binary, images_text, lenses_binary, lenses_text
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.codec.header import canonical_json
-from flexgs_edge.codec.sections import preamble
+from flexgs_edge.codec.sections import canonical_json, preamble
 from flexgs_edge.errors import InputError
 from flexgs_edge.run.open_scene import open_file
 from gltf_files import EXTENSION, GltfBuilder, splat_arrays

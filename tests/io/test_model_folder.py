@@ -8,8 +8,7 @@ import pytest
 
 from flexgs_edge.errors import FormatError
 from flexgs_edge.io.model_folder import find_companions
-from flexgs_edge.run.open_scene import open_scene
-from scene_files import random_rows, write_rows
+from scene_files import open_scene, random_rows, write_rows
 
 
 @pytest.fixture

@@ -156,8 +156,8 @@ def test_lists_in_other_elements(tmp_path: Path, order: str, first: bool) -> Non
 def test_plyfile_is_imported_only_where_it_is_needed(tmp_path: Path) -> None:
     path = write_rows(tmp_path / "a.ply", random_rows(3))
     code = (
-        "import sys; from flexgs_edge.run.open_scene import open_scene; from flexgs_edge.scene.check import check_scene; "
-        f"check_scene(open_scene({str(path)!r})); "
+        "import sys; from flexgs_edge.run.open_scene import open_file; from flexgs_edge.scene.check import check_scene; "
+        f"check_scene(open_file({str(path)!r}).source); "
         "sys.exit(' '.join({'plyfile', 'PIL', 'pyopencl', 'skimage'} & set(sys.modules)) or 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], capture_output=True, text=True)

@@ -15,9 +15,9 @@ from flexgs_edge.io.exchange import near_order, read_foreign, write_foreign
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import PLAIN
 from flexgs_edge.io.splat import write_splat
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.source import MemorySource
+from scene_files import open_scene
 from synthetic import random_scene
 
 

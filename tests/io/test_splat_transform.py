@@ -11,9 +11,9 @@ import pytest
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource
+from scene_files import open_scene
 from synthetic import random_scene
 
 PROGRAM = Path("@playcanvas") / "splat-transform" / "bin" / "cli.mjs"

@@ -13,11 +13,11 @@ import pytest
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
+from scene_files import open_scene
 from sog_files import entry, write_streamed
 
-FINEST = "level of detail 1 of 3, the finest that is there"
+FINEST = "level of detail 1 of 3, the finest that is there; coarser ones: --lod 2"
 
 
 def values(place: Path, rows: slice) -> dict[str, np.ndarray]:
@@ -72,12 +72,12 @@ def test_levels_that_are_asked_for(tmp_path: Path) -> None:
         ({"filenames": []}, "filenames: expected a list of file names"),
         ({"filenames": 7}, "filenames: expected a list of file names, found 7"),
         ({"filenames": ["../a/meta.json"] * 4}, "'../a/meta.json': expected the name of a file in its folder or below"),
-        ({"environment": 3}, "environment: expected a file name, found 3"),
+        ({"environment": 3}, "environment: expected a string, found 3"),
         ({"tree": None}, "tree: expected an object, found None"),
         ({"tree": {}}, "tree: expected a node with lods or a list of children"),
         ({"tree": {"children": [{"children": [1]}]}}, r"tree.children\[0\].children\[0\]: expected an object, found 1"),
         ({"tree": {"children": []}}, "found a tree whose leaves have no level"),
-        ({"tree": {"lods": {"one": entry(1, 0, 1)}}}, "tree.lods.: expected levels 0 to 2, found 'one'"),
+        ({"tree": {"lods": {"one": entry(1, 0, 1)}}}, "tree.lods: expected levels 0 to 2, found 'one'"),
         ({"tree": {"lods": {"3": entry(1, 0, 1)}}}, "expected levels 0 to 2, found '3'"),
         ({"tree": {"lods": {"1": entry(4, 0, 1)}}}, "tree.lods.1.file: expected a whole number from 0 to 3, found 4"),
         ({"tree": {"lods": {"1": {"file": 1}}}}, "tree.lods.1.count: expected a whole number"),
@@ -105,7 +105,10 @@ def test_damage_inside_is_placed(tmp_path: Path) -> None:
 def test_wild_scene(wild: Path) -> None:
     place = wild / "pc-playbot" / "lod-meta.json"
     source = read_foreign(place)
-    assert (source.count, source.notes) == (125_000, ("level of detail 2 of 7, the finest that is there",))
+    assert (source.count, source.notes) == (
+        125_000,
+        ("level of detail 2 of 7, the finest that is there; coarser ones: --lod 3, 4, 5, 6",),
+    )
     level, robot = read_foreign(place, Reading(lod=5)), read_foreign(wild / "playbot5.sog")
     for field, plane in level.read(slice(0, 3000), list(FIELD)).items():
         np.testing.assert_array_equal(plane, robot.read(slice(0, 3000), [field])[field])

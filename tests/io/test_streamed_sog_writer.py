@@ -21,9 +21,9 @@ from flexgs_edge.io.exchange import read_foreign
 from flexgs_edge.io.frames import Frame
 from flexgs_edge.io.ply import PlySource, write_ply
 from flexgs_edge.io.reading import Reading
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.source import SceneSource
 from grid_scenes import STEPS, make_planes
+from scene_files import open_scene
 from synthetic import random_scene
 
 ROWS = 400
@@ -65,6 +65,8 @@ def test_levels_are_the_scene_up_to_a_layer(
     assert result.size == sum(path.stat().st_size for path in files)
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert (meta["lodLevels"], meta["counts"], meta["count"]) == (2, [ROWS, 150], ROWS + 150)
+    told = read_foreign(tmp_path / "out" / "lod-meta.json").notes
+    assert told == ("level of detail 0 of 2, the finest that is there; coarser ones: --lod 1",)
     found = leaves(meta["tree"])
     assert len(found) == (1 if leaf_rows > ROWS else 8)
     source = open_scene(scene)

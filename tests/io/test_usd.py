@@ -15,10 +15,10 @@ from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.io.exchange import near_order, write_foreign
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.io.usd import COEFFICIENTS, DEGREE, TYPE
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.rotations import normalize_quats
 from flexgs_edge.scene.source import MemorySource, Planes
+from scene_files import open_scene
 from synthetic import random_scene
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")

@@ -15,9 +15,8 @@ import pytest
 from flexgs_edge.errors import BudgetError, DeviceError
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS, TwinBackend
 from flexgs_edge.kernels.choose_device import SELF_TEST, DeviceInfo, choose_device, list_devices, run_self_test
-from flexgs_edge.kernels.open_backend import open_backend
-from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.session import SMALL_WRITE, Session
+from flexgs_edge.kernels.opencl import SMALL_WRITE, OpenCLBackend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from kernel_fixtures import default_device, large_budget
 
@@ -122,7 +121,7 @@ def test_no_platform(tmp_path: Path) -> None:
     code = (
         "from flexgs_edge.memory.budget import MemoryBudget\n"
         "from flexgs_edge.errors import DeviceError\n"
-        "from flexgs_edge.kernels.open_backend import open_backend\n"
+        "from flexgs_edge.kernels.tested import open_backend\n"
         "assert open_backend('numpy', MemoryBudget(1 << 30)).is_numpy\n"
         "try:\n    open_backend(None, MemoryBudget(1 << 30))\n"
         "except DeviceError as error:\n    print(error)\n"
@@ -155,11 +154,11 @@ def test_widths_that_there_are_not(width: int, form: str) -> None:
 
 
 @pytest.fixture
-def session() -> Session:
-    return Session(default_device(), MemoryBudget(1 << 20))
+def session() -> OpenCLBackend:
+    return OpenCLBackend(default_device(), MemoryBudget(1 << 20))
 
 
-def test_build_failure(session: Session) -> None:
+def test_build_failure(session: OpenCLBackend) -> None:
     """The message has the kernel, the device, the options and the compiler's words."""
     with pytest.raises(DeviceError) as caught:
         session.kernel(
@@ -173,7 +172,7 @@ def test_missing_define() -> None:
     """Kernels refuse to build without their defines instead of guessing."""
     from flexgs_edge.kernels.cl_sources import load_source
 
-    session = Session(default_device(), large_budget())
+    session = OpenCLBackend(default_device(), large_budget())
     for name, options in (
         ("activate.cl", ()),
         ("blend_cpu.cl", ("-DW=16",)),
@@ -183,18 +182,18 @@ def test_missing_define() -> None:
             session.kernel(load_source(name), "blend" if "blend" in name else "activate", options, "b")
 
 
-def test_programs_are_built_once(session: Session) -> None:
+def test_programs_are_built_once(session: OpenCLBackend) -> None:
     source = "__kernel void one(__global float *x) { x[0] = 1; } __kernel void two(__global float *x) { x[0] = 2; }"
     session.kernel(source, "one", (), "b")
     seconds = session.compile_seconds
     session.kernel(source, "two", (), "b")
     assert session.compile_seconds == seconds > 0
-    other = Session(default_device(), MemoryBudget(1 << 20))
+    other = OpenCLBackend(default_device(), MemoryBudget(1 << 20))
     other.kernel(source, "two", (), "b")
     assert other.compile_seconds == 0
 
 
-def test_arrays_are_counted(session: Session) -> None:
+def test_arrays_are_counted(session: OpenCLBackend) -> None:
     array = session.array((1000,), np.float32)
     assert session.budget.used == 4000
     session.write(array, np.arange(10, dtype=np.float32), 7)
@@ -222,7 +221,7 @@ TRIES = 5
 """On a busy machine the host may lie idle while a kernel runs, as if it waited."""
 
 
-def test_small_writes_do_not_wait(session: Session) -> None:
+def test_small_writes_do_not_wait(session: OpenCLBackend) -> None:
     """Kernels before a write see the old values, those after it the new ones, whatever becomes of the host's array."""
     given, seen = session.array((4,), np.float32), session.array((4,), np.float32)
     kernel = session.kernel(SLOW, "slow", (), "bb")
@@ -258,10 +257,12 @@ def test_small_writes_do_not_wait(session: Session) -> None:
 
 
 @pytest.mark.parametrize("waits", [False, True])
-def test_values_that_stay_are_not_waited_for(session: Session, waits: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_that_stay_are_not_waited_for(
+    session: OpenCLBackend, waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Writes of values that stay, and reads that need not wait, come in the queue's order; very large writes wait."""
     if waits:
-        monkeypatch.setattr("flexgs_edge.kernels.session.HELD_WRITE", SMALL_WRITE)
+        monkeypatch.setattr("flexgs_edge.kernels.opencl.HELD_WRITE", SMALL_WRITE)
     given, seen = session.array((SMALL_WRITE // 4 + 1,), np.float32), session.array((1,), np.float32)
     kernel = session.kernel(SLOW, "slow", (), "bb")
     session.write(given, np.full(given.shape, 1, np.float32))
@@ -283,7 +284,7 @@ def test_values_that_stay_are_not_waited_for(session: Session, waits: bool, monk
 
 def test_buffers_beyond_the_device() -> None:
     """What the budget allows and the device refuses is a budget error that names the device's limit."""
-    session = Session(default_device(), MemoryBudget(1 << 62))
+    session = OpenCLBackend(default_device(), MemoryBudget(1 << 62))
     with pytest.raises(BudgetError, match=str(default_device().max_alloc_bytes)):
         session.array((1 << 44,), np.uint8)
     assert session.budget.used == 0
@@ -293,7 +294,7 @@ def test_every_signature_fits_its_kernel() -> None:
     """One letter an argument: the numbers that the kernels were compiled with."""
     from flexgs_edge.kernels.cl_sources import load_source
 
-    session = Session(default_device(), large_budget())
+    session = OpenCLBackend(default_device(), large_budget())
     for form, width in (("cpu", 8), ("gpu", 1)):
         for name, spec in {**KERNELS, **CODEC_KERNELS}.items():
             source = load_source(spec.file.format(form=form), spec.stats, form)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flexgs_edge.kernels.compiler_cache import ELF, STAMP, VARIABLE, compiler_cache, prepare_compiler_cache
+from flexgs_edge.kernels.choose_device import ELF, STAMP, VARIABLE, compiler_cache, prepare_compiler_cache
 
 LIBRARY = (ELF.ljust(40, b"\0") + struct.pack("<Q", 64) + bytes(10) + struct.pack("<HH", 64, 2) + bytes(2)).ljust(
     192, b"\0"
@@ -78,7 +78,7 @@ def test_a_folder_of_somebody_else_is_not_trusted(
     (tmp_path / f"flexgs-edge-{os.getuid()}").mkdir(mode=0o777)
     (tmp_path / f"flexgs-edge-{os.getuid()}").chmod(0o777)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr("flexgs_edge.kernels.compiler_cache.SHARED_MEMORY", str(tmp_path / "file"))
+    monkeypatch.setattr("flexgs_edge.kernels.choose_device.SHARED_MEMORY", str(tmp_path / "file"))
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "kcache"))
     with caplog.at_level(logging.WARNING):
         prepare_compiler_cache()

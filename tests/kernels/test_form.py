@@ -12,8 +12,7 @@ import pytest
 
 from flexgs_edge.errors import DeviceError
 from flexgs_edge.kernels import self_test_child
-from flexgs_edge.kernels.choose_device import DeviceInfo
-from flexgs_edge.kernels.form import Form, likely_form, possible_forms
+from flexgs_edge.kernels.choose_device import DeviceInfo, Form, likely_form, possible_forms
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.self_test_child import Measured, may_write_fma, measure_forms
 from kernel_fixtures import default_device, large_budget

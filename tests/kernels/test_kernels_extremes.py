@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import reference_renderer
+from benchmarks.harness import read_sums
 from extreme_scenes import AHEAD, EXTREMES, changed
 from fits import use_fit
 from flexgs_edge.constants import FIXED_ERROR
@@ -20,8 +21,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.check import SH_LARGEST, check_scene
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, count, draw, large_budget, open_form, same_bits
 from reference_renderer import Reference
 from synthetic import look_from, make_camera, random_scene
@@ -91,8 +91,8 @@ def sums_of(backend: Backend, name: str, source: MemorySource) -> np.ndarray:
     renderer = Renderer(backend, large_budget(), background=(0.2, 0.5, 1.0), antialiased=extreme.antialiased)
     with renderer.load(source) as scene, References() as references:
         references.add(0, renderer.render_planes(scene, extreme.camera) / 2)
-        sums = renderer.read_sums(
-            renderer.residual_and_removal_sums(scene, extreme.camera, references[0]), 6, source.count
+        sums = read_sums(
+            renderer, renderer.residual_and_removal_sums(scene, extreme.camera, references[0]), 6, source.count
         )
     renderer.release()
     return sums
@@ -200,7 +200,7 @@ def test_any_rows(
         assert np.isfinite(image).all() and image.min() >= 0
         references.add(0, image[:, ::-1] / 3)
         sums = renderer.residual_and_removal_sums(scene, camera, references[0])
-        assert (renderer.read_sums(sums, 6, source.count)[[0, 4, 5]] >= 0).all()
+        assert (read_sums(renderer, sums, 6, source.count)[[0, 4, 5]] >= 0).all()
         costs = measure_costs(renderer, scene, [camera] * 2)
     renderer.release()
     for values in (costs.removal, costs.weight2, costs.sh):

@@ -7,17 +7,18 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import KERNELS
 from flexgs_edge.kernels.twins import TWINS
 from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 from kernel_fixtures import (
     FORMS,
     PairedBackend,
@@ -171,12 +172,12 @@ def test_removal_costs_and_residuals(form: str, pairs: int, monkeypatch: pytest.
     assert paired.launched["blend_removal"] == paired.launched["blend_residual"] >= 1
     renderer = Renderer(paired, large_budget(), background=(0.1, 0.5, 1.0))
     with renderer.load(source) as scene:
-        both = renderer.read_sums(
-            renderer.residual_and_removal_sums(scene, camera, padded_target(camera, 19)), 6, source.count
+        both = read_sums(
+            renderer, renderer.residual_and_removal_sums(scene, camera, padded_target(camera, 19)), 6, source.count
         )
-        apart = renderer.read_sums(renderer.removal_sums(scene, camera), 2, source.count)
+        apart = read_sums(renderer, renderer.removal_sums(scene, camera), 2, source.count)
         assert (both[4:] == apart).all() and (both[1:4] != 0).any()
-        apart = renderer.read_sums(renderer.residual_sums(scene, camera, padded_target(camera, 19)), 4, source.count)
+        apart = read_sums(renderer, renderer.residual_sums(scene, camera, padded_target(camera, 19)), 4, source.count)
         assert (both[:4] == apart).all()
     renderer.release()
 

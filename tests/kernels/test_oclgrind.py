@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import decode_chunk, write_grid
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
@@ -29,13 +30,12 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.descent import Descent, bit_prices
 from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
-from flexgs_edge.quality.flip import flips
-from flexgs_edge.quality.ssim import ssims
+from flexgs_edge.quality.similarity import flips, ssims
 from flexgs_edge.render.fit import Fit
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 from grid_scenes import STEPS, make_grid
 from kernel_fixtures import default_device, large_budget, same_bits
 from quantized_scenes import quantize_all
@@ -107,7 +107,7 @@ def second_passes(drawer: Renderer, camera: Camera) -> Iterator[np.ndarray]:
         yield costs.sh
         references: Any = [drawer.render_planes(scene, camera).astype(np.float16) + np.float16(0.1)]
         sums = drawer.residual_and_removal_sums(scene, camera, references[0])
-        yield drawer.read_sums(sums, 6, source.count)
+        yield read_sums(drawer, sums, 6, source.count)
     planes = source.read(slice(0, source.count), list(FIELD))
     planes = refit_colours(
         planes, np.full(source.count, 4), Original(drawer, source.origin, [camera], references), rounds=1

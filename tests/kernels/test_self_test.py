@@ -12,9 +12,8 @@ from benchmarks.self_test import FORMS as RECORDED_FORMS
 from benchmarks.self_test_faults import faults
 from flexgs_edge.kernels.backend import CODEC_KERNELS, KERNELS
 from flexgs_edge.kernels.cl_sources import KERNEL_DIR_VARIABLE, kernel_dir
-from flexgs_edge.kernels.launch_record import EXACT_ZEROS, Record, checksum, load_record
 from flexgs_edge.kernels.opencl import OpenCLBackend
-from flexgs_edge.kernels.self_test import verdict
+from flexgs_edge.kernels.self_test import EXACT_ZEROS, Record, checksum, load_record, verdict
 from kernel_fixtures import ALL_FORMS, FORMS, default_device, large_budget, open_form
 
 

@@ -16,11 +16,11 @@ import pytest
 
 from flexgs_edge.cli import app
 from flexgs_edge.errors import BudgetError, DeviceError
-from flexgs_edge.kernels import session as programs
+from flexgs_edge.kernels import opencl as programs
 from flexgs_edge.kernels import tested as module
-from flexgs_edge.kernels import verdict as verdicts
+from flexgs_edge.kernels import tested as verdicts
 from flexgs_edge.kernels.choose_device import DeviceInfo, choose_device, list_devices
-from flexgs_edge.kernels.session import Session
+from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.tested import (
     FORM,
     MARK,
@@ -224,7 +224,7 @@ def test_a_device_that_fails_in_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors of the runtime name the device and what it did, and have exit codes."""
     import pyopencl as cl
 
-    session = Session(default_device(), large_budget())
+    session = OpenCLBackend(default_device(), large_budget())
     array = session.array((4,), "f4")
 
     def fails(kind: type[cl.Error], routine: str) -> Any:
@@ -245,7 +245,7 @@ def test_a_device_that_fails_in_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(programs, "_CONTEXTS", {})
         patch.setattr(cl, "Context", fails(cl.RuntimeError, "clCreateContext"))
         with pytest.raises(DeviceError, match="does not open"):
-            Session(replace(default_device(), context=None), large_budget())
+            OpenCLBackend(replace(default_device(), context=None), large_budget())
     array.release()
 
 

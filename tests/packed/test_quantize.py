@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.packed.bitpack import pack, pack_into, plane_bytes, unpack
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec, pack, pack_into, plane_bytes, unpack
 from flexgs_edge.packed.quantize import (
     LARGEST,
-    codes,
+    QuantizedArray,
     dequantize,
     group_bounds,
     group_count,
@@ -41,6 +40,15 @@ def plain_codes(values: np.ndarray, bits: int, groups: int) -> tuple[np.ndarray,
             q = 0 if step < 2.0**-126 else int(np.clip(np.rint((values[i] - low) / step), 0, top))
             out[i], back[i] = q, low + np.float32(q) * step if q else low
     return out, back
+
+
+def codes(array: QuantizedArray, rows: slice) -> np.ndarray:
+    """[c, n] u16, the codes of `rows` (a slice with step 1)."""
+    start, stop, _ = rows.indices(array.count)
+    out = np.empty((array.channels, max(stop - start, 0)), np.uint16)
+    for channel in range(array.channels):
+        out[channel] = unpack(array.planes[channel], array.bits, start, stop)
+    return out
 
 
 def bound_by_row(array) -> np.ndarray:  # type: ignore[no-untyped-def]

@@ -13,8 +13,8 @@ from flexgs_edge import constants
 from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.quality import flip
-from flexgs_edge.quality.flip import flip_bytes, flip_maps, flips, taps
+from flexgs_edge.quality import similarity
+from flexgs_edge.quality.similarity import flip_bytes, flip_maps, flips, taps
 from kernel_fixtures import ALL_FORMS, open_form
 
 PHOTOS = Path(__file__).resolve().parents[2] / "samples" / "still_life" / "images"
@@ -115,7 +115,7 @@ def test_pairs_of_the_same_images_are_those_of_each_alone() -> None:
 def test_bands_change_no_bit(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b = waves(61, 45)
     (whole,) = flip_maps(open_form("w8"), [(a, b)])
-    monkeypatch.setattr(flip, "BAND", band)
+    monkeypatch.setattr(similarity, "BAND", band)
     (parts,) = flip_maps(open_form("w8"), [(a, b)])
     assert parts.tobytes() == whole.tobytes()
 

@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.quality.ssim import ssim_bytes, ssims
+from flexgs_edge.quality.similarity import ssim_bytes, ssims
 from kernel_fixtures import ALL_FORMS, open_form
 
 

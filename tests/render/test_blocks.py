@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import ROW_BLOCK, SUM_LANES
@@ -15,7 +16,7 @@ from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 from flexgs_edge.views.sums import ViewSums
 from kernel_fixtures import FORMS, PairedBackend, large_budget, launch, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
@@ -56,7 +57,7 @@ def everything(form: str, antialiased: bool, blocks: bool) -> tuple[list[np.ndar
             renderer.add_statistics(scene, camera, statistics)
             assert renderer.parts is not None
             counts.append(sum(part.count for part in renderer.parts.values()))
-            found.append(renderer.read_sums(renderer.removal_sums(scene, camera), 2, ROWS))
+            found.append(read_sums(renderer, renderer.removal_sums(scene, camera), 2, ROWS))
         sums = ViewSums(renderer, scene, [cost_sums(renderer, 2)])
         assert len(list(sums.draw("removal_sums", views()))) == 4
         parts = cost_parts(2, ROWS, renderer.storage)

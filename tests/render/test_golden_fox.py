@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from flexgs_edge.cameras.camera import Camera, split_views
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
@@ -93,7 +94,7 @@ def test_fox_statistics(fox: Loaded, golden: dict[str, Any], view: int) -> None:
 def test_fox_removal_costs(fox: Loaded, golden: dict[str, Any], view: int) -> None:
     """Squared errors of removal: the same ranking, and the same sum."""
     sums = fox.renderer.removal_sums(fox.scene, fox.cameras[view])
-    costs = fox.renderer.read_sums(sums, 2, fox.scene.count)[0] / FIXED_ERROR
+    costs = read_sums(fox.renderer, sums, 2, fox.scene.count)[0] / FIXED_ERROR
     expected = golden[f"dse_{view}"].astype(np.float64)
     assert abs(costs.sum() - expected.sum()) <= 1e-4 * expected.sum()
     seen = expected > 1e-6

@@ -9,13 +9,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import BudgetError
-from flexgs_edge.kernels.backend import Backend, TwinBackend
-from flexgs_edge.kernels.window import window
+from flexgs_edge.kernels.backend import Backend, TwinBackend, window
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.descent import Descent
 from flexgs_edge.render.fit import GRADIENT_SUMS, shapes_bytes, structure_shapes
-from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.render.residual import add_structure, target_residual
+from flexgs_edge.render.renderer import Renderer, add_structure, target_residual
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.scene.fields import FIELD
 from kernel_fixtures import ALL_FORMS, FORMS, PairedBackend, large_budget, open_form, same_bits

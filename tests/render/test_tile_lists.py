@@ -9,7 +9,7 @@ import pytest
 
 from fits import use_fit
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.render.tile_lists import PIECES, split_batches
+from flexgs_edge.render.view_buffers import PIECES, split_batches
 from kernel_fixtures import large_budget, open_form
 from synthetic import make_camera, random_scene
 

@@ -7,8 +7,7 @@ import pytest
 
 from flexgs_edge.goals.steps import Choice, Step
 from flexgs_edge.goals.target import MaxDrop, Measurement
-from flexgs_edge.report.material import ERROR_SCALE, error_map, ramp
-from flexgs_edge.report.pages import nice_range, step_chart
+from flexgs_edge.report.pages import ERROR_SCALE, error_map, nice_range, ramp, step_chart
 
 
 def test_chart_needs_two_steps_and_holds_any_numbers() -> None:

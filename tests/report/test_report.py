@@ -20,20 +20,28 @@ from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.errors import BudgetError, InputError, TargetError
 from flexgs_edge.goals.steps import Choice, SearchResult, Step
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.quality.flip import flip_maps
+from flexgs_edge.progress import Stopwatch
+from flexgs_edge.quality.similarity import flip_maps
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.report.material import FLIP_SCALE, Material, Shot, error_map, ramp
-from flexgs_edge.report.pages import compress_page, evaluate_page, step_chart
+from flexgs_edge.report.pages import (
+    FLIP_SCALE,
+    Material,
+    Shot,
+    compress_page,
+    error_map,
+    evaluate_page,
+    ramp,
+    step_chart,
+)
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.report.run_info import RunInfo, SceneInfo, ViewsInfo
-from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.inputs import companions_of
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.run.reporter import Reporter, encode
 from page_parser import Page
+from scene_files import open_scene
 from tiny_project import HEIGHT, WIDTH, make_project, write_cameras
 
 FAST: dict[str, Any] = {"effort": "fast", "holdout": 4}

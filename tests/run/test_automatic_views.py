@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.commands.render import LABEL, WIDTH, draw_sheet
 from flexgs_edge.commands.view import view
-from flexgs_edge.commands.views import LABEL, WIDTH, draw_sheet
 from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.ply import write_ply

@@ -20,9 +20,8 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.check_views import check_views
 from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions, ViewOptions
-from flexgs_edge.run.run import Run, open_run
+from flexgs_edge.run.run import Run, frame_warnings, open_run
 from flexgs_edge.run.view_set import GivenViews
-from flexgs_edge.run.warnings import frame_warnings
 from flexgs_edge.scene.source import MemorySource
 
 WIDTH = 120

@@ -13,10 +13,10 @@ from flexgs_edge.commands import decompress as command
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.kernels.open_backend import open_backend
+from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.memory.process import current_rss
-from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.progress import Stopwatch
 from flexgs_edge.run.decoding import decode_bytes, decoded_once, decoder, read_often
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource

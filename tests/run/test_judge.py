@@ -11,9 +11,9 @@ import pytest
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.progress import Stopwatch
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.clock import Stopwatch
 from flexgs_edge.run.inputs import companions_of, load_scene, resolve_drawing
 from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import ViewOptions

@@ -20,9 +20,9 @@ from flexgs_edge.io.frames import RDF, RUB, FrameSource
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.run.inputs import load_scene
-from flexgs_edge.run.open_scene import SUFFIXES, check_fgs, is_fgs, open_file, open_scene, scene_file
+from flexgs_edge.run.open_scene import SUFFIXES, check_fgs, is_fgs, open_file, scene_file
 from grid_scenes import make_grid
-from scene_files import random_rows, write_rows
+from scene_files import open_scene, random_rows, write_rows
 
 ROWS = random_rows(3, 1)
 

@@ -17,8 +17,7 @@ from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.view import view
 from flexgs_edge.errors import FormatError, InputError
-from flexgs_edge.io.crops import parse_crop
-from flexgs_edge.io.reading import Reading
+from flexgs_edge.io.reading import Reading, parse_crop
 from flexgs_edge.run.inputs import checked_scene, load_scene
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
@@ -193,7 +192,7 @@ def test_commands_work_on_what_is_inside(project: Path, tmp_path: Path) -> None:
     shown = view(tmp_path / "one.fgs", tmp_path / "page.html", ViewOptions(crop="0,0,4,0.5"))
     assert 0 < shown.scene.count < one.count and view(tmp_path / "one.fgs", tmp_path / "all.html").size == one.size
     # A file that is not cropped is compared within the crop alone.
-    whole = compress(ply, tmp_path / "whole.fgs", effort="fast", max_drop=0.3)
+    whole = compress(ply, tmp_path / "whole.fgs", effort="fast", max_drop=0.1)
     within = evaluate(tmp_path / "whole.fgs", ply, ViewOptions(crop=box)).quality.fidelity
     assert whole.quality is not None and within is not None and within > 30
     with pytest.raises(InputError, match="--images: the scene is cropped, and photos show what lies beyond"):

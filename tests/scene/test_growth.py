@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.growth import GrownSource, growth
+from flexgs_edge.scene.source import GrownSource, growth
 from synthetic import random_scene
 
 

@@ -9,9 +9,13 @@ import pytest
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import PlySource
-from flexgs_edge.scene.check import check_scene
+from flexgs_edge.memory.rows import BLOCK_ROWS
+from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.scene.check import MOST_ALIKE, check_scene, without_hidden
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import MemorySource
+from kernel_fixtures import large_budget, open_form
+from synthetic import make_camera
 
 ALL = [field.name for field in FIELDS]
 
@@ -189,3 +193,40 @@ def test_files_that_are_activated_already_are_warned_of(seen: str, caplog: pytes
         notes = check_scene(MemorySource(data), chunk_rows=3).notes
     assert any("activated already" in note for note in notes) == (seen == "both")
     assert ("all 40 opacities lie in 0..1 and all scales above 0" in caplog.text) == (seen == "both")
+
+
+def test_splats_behind_enough_of_their_own_shape_and_place_are_left_out() -> None:
+    count = BLOCK_ROWS + 3 * MOST_ALIKE
+    given = arrays(count)
+    crowd = np.concatenate([np.arange(5, 1005), np.arange(BLOCK_ROWS - 9, BLOCK_ROWS + MOST_ALIKE)])  # in both blocks
+    for field in ("means", "log_scales", "quats", "opacity_logits"):
+        given[field][:, crowd] = given[field][:, :1]
+    given["means"][:, crowd[-1] + 1 :] = given["means"][:, :1]  # at the same place, each of another shape
+    left = without_hidden(MemorySource(given))
+    kept = np.setdiff1d(np.arange(count), crowd[MOST_ALIKE - 1 :])
+    np.testing.assert_array_equal(left.read(slice(0, left.count), ["sh_dc"])["sh_dc"], given["sh_dc"][:, kept])
+    assert left.notes[0].startswith("1010 of")
+
+
+def test_pictures_stay_without_what_is_hidden() -> None:
+    """A faint crowd, as opaque as just shows, and a bright splat behind it."""
+    count = MOST_ALIKE + 200
+    planes = {name: np.repeat(values[:, :1], count + 1, axis=1) for name, values in arrays().items()}
+    planes["sh_dc"] = np.random.default_rng(0).normal(size=(3, count + 1)).astype(np.float32)
+    planes["means"][:] = np.array([[0.0], [0.0], [4.0]])
+    planes["means"][2, -1] = 6.0
+    planes["log_scales"][:], planes["opacity_logits"][:] = 0.0, -5.5
+    planes["opacity_logits"][:, -1], planes["sh_dc"][:, -1] = 5.0, 9.0
+    source = MemorySource(planes)
+    renderer, pictures = Renderer(open_form("w8"), large_budget()), []
+    for each in (source, without_hidden(source)):
+        with renderer.load(each) as scene:
+            pictures.append(renderer.render(scene, make_camera(40, 30)).copy())
+    assert without_hidden(source).count < source.count and pictures[0].any()
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_a_scene_of_as_many_alike_as_can_show_stays_as_it_is() -> None:
+    given = {name: np.repeat(values[:, :1], MOST_ALIKE, axis=1) for name, values in arrays().items()}
+    source = MemorySource(given)
+    assert without_hidden(source) is source

@@ -7,8 +7,7 @@ import pytest
 
 from flexgs_edge.kernels.twins.project import sh_basis
 from flexgs_edge.scene.fields import sh_rest_count
-from flexgs_edge.scene.rotations import matrices, quats_of, times
-from flexgs_edge.scene.turn_sh import band_matrices, sh_functions, turn_sh
+from flexgs_edge.scene.rotations import band_matrices, matrices, quats_of, sh_functions, times, turn_sh
 from flexgs_edge.small_matrices import product
 
 

@@ -10,8 +10,8 @@ import pytest
 from flexgs_edge.quality.psnr import mse
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.plots import BarChart, LineChart, Series, draw
+from flexgs_edge.run.few_poses import visible_depths
 from flexgs_edge.studies import stability
-from flexgs_edge.views.depths import visible_depths
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, make_splats
 

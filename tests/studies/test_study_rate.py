@@ -13,8 +13,8 @@ import click
 import pytest
 
 from flexgs_edge.cli import app
-from flexgs_edge.cli.study import RATIOS
 from flexgs_edge.cli.study import rate as command
+from flexgs_edge.cli.value_types import RATIOS
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.evaluate import evaluate
@@ -90,7 +90,7 @@ def test_csv_page_and_charts_hold_the_same(study: tuple[Study, Path]) -> None:
     for method in drawn:
         assert drawn[method] == [row["size"] for row in rows if row["method"] == method]
     # A header of 2 kB is more than a thousandth of the scene.
-    assert "Left out or not reached: best at 1000x; paper at 1000x." in result.to_text()
+    assert "Left out or not reached: best at 1000x; paper at 1000x." in result.summary()
 
 
 def test_without_photos(project: Path, tmp_path: Path) -> None:

@@ -11,11 +11,25 @@ import pytest
 from flexgs_edge.viewer import join as shorten
 from flexgs_edge.viewer.assets import web_files
 from flexgs_edge.viewer.join import shorten_script, shorten_style
+from flexgs_edge.viewer.shaders import shorten_shader
 
 
 def test_shaders_lose_what_only_readers_need() -> None:
     script = "const a = `#version 300 es\n  // why\n  int a = - -1;  // b\n  f( b ) [c & 1] / 2.0;\n`;"
     assert "#version 300 es\nint a=- -1;\nf(b)[c&1]/2.0;\n" in shorten_script(script)
+
+
+def test_names_of_shaders_become_short_but_for_those_that_others_know() -> None:
+    text = (
+        "layout(location = 0) in uint row;\nuniform float near;\nflat out vec2 centre;\n"
+        "float halved(float near, vec3 place) {\n  float a = near - -1.0, other = place.x + place.place;\n  i++;\n"
+        "  return 0.28209479177387814 * other * near;\n}\nvoid main() { centre = vec2(halved(near, row.xyz)); }\n"
+    )
+    assert shorten_shader(text) == (
+        "layout(location=0)in uint row;\nuniform float near;\nflat out vec2 centre;\n"
+        "float b(float near,vec3 c){\nfloat a=near- -1.0,d=c.x+c.place;\ni++;\n"
+        "return 0.282094792*d*near;\n}\nvoid main(){centre=vec2(b(near,row.xyz));}\n"
+    )
 
 
 def test_other_templates_stay() -> None:

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,14 @@ import pytest
 from PIL import Image
 
 from browser import Browser
-from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.render import render_views
-from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.viewer import server
-from grid_scenes import sample_grid
+from grid_scenes import previewed, sample_grid
 from viewer_tab import LOOK, POSES, Drawn, decibels, faults, picture, served, until
 
 
@@ -36,26 +32,6 @@ def scene(sample_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("scene") / "still_life.fgs"
     write_grid(place, sample_grid(sample_dir, 1), {}, chunk_rows=8192)
     return place
-
-
-def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:
-    """The same scene behind a preview of every eighth row without SH, and that preview."""
-    source = open_fgs(scene)
-    assert isinstance(source, GridSource)
-    grid = source.grid()
-    some = grid.take(np.arange(0, grid.count, 8))
-    nothing = np.zeros_like(some.sh_degrees)
-    steps = replace(some.step_sizes, sh=())
-    flat = replace(some, sh_degree=0, sh_degrees=nothing, sh=(), step_sizes=steps, layer=nothing)
-    order = np.argsort(cells_of_one_layer(flat), kind="stable")
-    small, place = folder / "small.fgs", folder / "still_life.fgs"
-    write_grid(small, flat.take(order), {})
-    write_grid(place, grid, {}, chunk_rows=chunk_rows, preview=small.read_bytes())
-    return place, small
-
-
-def cells_of_one_layer(grid: GridScene) -> np.ndarray:
-    return morton(grid.position.astype(np.int64) - grid.position.min(axis=1)[:, None])
 
 
 def stops_at(monkeypatch: pytest.MonkeyPatch, most: int) -> threading.Event:

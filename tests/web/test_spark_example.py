@@ -9,7 +9,6 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +16,10 @@ from PIL import Image
 
 import viewer_tab
 from browser import Browser
-from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.commands.render import render_views
-from viewer_tab import decibels, faults, until
+from viewer_tab import decibels, faults, pose_of, until
 
 POSES = (0, 27, 53)
 LEAST = 41
@@ -94,12 +92,6 @@ def test_files_of_other_formats_look_alike(
     poses = POSES[1:2]
     files = render_views(file, tmp_path, views=poses, cameras=str(cameras)).files
     assert min(fidelity(tab, f"{address}/{SPARK}/formats.html?file={file.name}", cameras, poses, files, turn)) >= least
-
-
-def pose_of(camera: Camera) -> dict[str, Any]:
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    numbers = {name: getattr(camera, name) for name in names}
-    return {"rotation": camera.rotation.tolist(), "position": camera.center.tolist(), **numbers}
 
 
 PAGE = """<!doctype html>

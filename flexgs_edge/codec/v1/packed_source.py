@@ -1,17 +1,14 @@
 """Read a version 1 file as a scene source."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.v1.container import Container
-from flexgs_edge.codec.v1.header import CHUNK_ROWS
+from flexgs_edge.codec.v1.container import CHUNK_ROWS, Container
 from flexgs_edge.packed.bitpack import plane_bytes
-from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, dequantize_part
+from flexgs_edge.packed.quantize import QuantizedArray, QuantizedScene, dequantize
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
@@ -35,10 +32,7 @@ class FgsSource(SceneSource):
         self._last: tuple[int, dict[str, QuantizedArray]] | None = None
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
-        """See `SceneSource.read`.
-
-        A chunk is dequantized from the first to the last of its rows, also if they are sparse.
-        """
+        """See `SceneSource.read`. A chunk is dequantized from the first to the last of its rows, also if they are sparse."""
         rows, planes = self.begin_read(rows, fields, out)
         for chunk, wanted, place in by_chunk(rows, np.arange(0, self.count, CHUNK_ROWS)):
             first, arrays = self._chunk(chunk)
@@ -97,7 +91,7 @@ def _fill(array: QuantizedArray, first: int, rows: Rows, out: np.ndarray) -> Non
     """Dequantize `rows` into `out` [c, n]; rows beyond the array (rows without SH) become zero."""
     if isinstance(rows, slice):
         here = slice(min(rows.start, array.count), min(rows.stop, array.count))
-        dequantize_part(array, first, here, out[:, : here.stop - here.start])
+        dequantize(array, here, first, out[:, : here.stop - here.start])
         out[:, here.stop - here.start :] = 0
         return
     inside = rows < array.count
@@ -105,4 +99,4 @@ def _fill(array: QuantizedArray, first: int, rows: Rows, out: np.ndarray) -> Non
     if inside.any():
         chosen = rows[inside]
         start = int(chosen.min())
-        out[:, inside] = dequantize_part(array, first, slice(start, int(chosen.max()) + 1))[:, chosen - start]
+        out[:, inside] = dequantize(array, slice(start, int(chosen.max()) + 1), first)[:, chosen - start]

@@ -1,7 +1,5 @@
 """Write, open, cut and verify `.fgs` files of version 2 (docs/format.md)."""
 
-from __future__ import annotations
-
 import io
 import os
 import zlib
@@ -11,12 +9,29 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from flexgs_edge.codec.header import PREAMBLE_BYTES, Section, format_error
-from flexgs_edge.codec.sections import ChunkEntry, SectionFile, Verification, checked, preamble
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, check_end, least_bytes
+from flexgs_edge.codec.sections import (
+    PREAMBLE_BYTES,
+    ChunkEntry,
+    Section,
+    SectionFile,
+    Verification,
+    checked,
+    format_error,
+    preamble,
+)
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
-from flexgs_edge.codec.v2.header import HEADER_MOST, Channels, GridHeader, decode_header, encode_header
+from flexgs_edge.codec.v2.header import (
+    CHUNK_ROWS,
+    HEADER_MOST,
+    Channels,
+    Chunk,
+    GridHeader,
+    check_end,
+    decode_header,
+    encode_header,
+    least_bytes,
+)
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.octree import TooManyNodes
 from flexgs_edge.codec.v2.ports import DecodePort
@@ -31,7 +46,6 @@ from flexgs_edge.memory.storage import IN_MEMORY, Storage
 BOXES = "boxes"  # Its name among the settings of a file
 FEWEST, MOST = 8, 4096  # Fewer chunks come one after the other anyway; of more, the header would grow too long
 VERSION = 2
-__all__ = ["GridContainer", "Preview", "channel_bytes", "coded_size", "trim_container", "verify_grid", "write_grid"]
 
 
 def with_boxes(settings: Mapping[str, Any], grid: GridScene, chunks: Sequence[Chunk]) -> dict[str, Any]:
@@ -201,12 +215,10 @@ class GridContainer(SectionFile):
         with self.open() as file:
             size = self.size = file.seek(0, os.SEEK_END)
             file.seek(0)
-
-            def wrong_size(header: GridHeader) -> str:
-                least = header.least_size
-                return "" if least <= size else f"its counts make a file of at least {least}"
-
-            self.header = self._read_header(file, size, _wrong_length, decode_header, wrong_size)
+            self.header = self._read_header(file, size, _wrong_length, decode_header)
+        least = self.header.least_size
+        if least > size:
+            raise self._error(PREAMBLE_BYTES, f"header: its counts make a file of at least {least} bytes, got {size}")
 
     def read_model(self) -> Model:
         """Read and check the model."""
@@ -257,10 +269,7 @@ class GridContainer(SectionFile):
         decode: Callable[[list[tuple[int, bytes]]], Sequence[Result | ValueError]],
         chunks: Sequence[tuple[Chunk, ChunkEntry]],
     ) -> list[Result]:
-        """Let `decode` work on the rows and bytes of some chunks.
-
-        An error of a chunk is raised with its name and place.
-        """
+        """Let `decode` work on the rows and bytes of some chunks. An error of a chunk is raised with its name and place."""
         jobs = [(chunk.stop - chunk.start, self.read_chunk(entry)) for chunk, entry in chunks]
         results: list[Result] = []
         for (_, entry), result in zip(chunks, decode(jobs), strict=True):

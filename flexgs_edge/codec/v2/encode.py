@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.codec.v2.device.encode_kernels import CountKernel, encode_streams
 from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.fit_groups import fit_group
 from flexgs_edge.codec.v2.groups import Group
+from flexgs_edge.codec.v2.header import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
 from flexgs_edge.codec.v2.model import SHARED, Model, group_kinds, tables_of
 from flexgs_edge.codec.v2.ports import UNIFORM, Batch, CountPort, FitPort
 from flexgs_edge.codec.v2.rans import Encoder, lane_count
@@ -55,8 +55,7 @@ def fit_levels(counts: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _in_units(bits: np.ndarray) -> np.ndarray:
-    whole: np.ndarray = np.rint(bits / _UNIT) * _UNIT
-    return whole
+    return np.rint(bits / _UNIT) * _UNIT
 
 
 def _prices(levels: Sequence[np.ndarray]) -> np.ndarray:
@@ -101,8 +100,7 @@ def _symbol_bits(counts: np.ndarray, levels: np.ndarray) -> np.ndarray:
 def _change_bits(before: np.ndarray, levels: np.ndarray, prices: np.ndarray) -> np.ndarray:
     """Bits of levels behind those of the table before."""
     classes = 1 + (before > 0) + (before > OFTEN)
-    bits: np.ndarray = prices[classes, (levels.astype(np.int64) - before.astype(np.int64)) % LEVELS]
-    return bits
+    return prices[classes, (levels.astype(np.int64) - before.astype(np.int64)) % LEVELS]
 
 
 def cheapest_path(bits: np.ndarray, prices: np.ndarray) -> np.ndarray:
@@ -159,10 +157,7 @@ def chunk_codes(grid: GridScene, cells: np.ndarray, chunk: Chunk) -> ChunkCodes:
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """A fitted model, and the symbols of a scene for its file.
-
-    `bits` is the information in the symbols of each alphabet.
-    """
+    """A fitted model, and the symbols of a scene for its file. `bits` is the information in the symbols of each alphabet."""
 
     model: Model
     low: np.ndarray

@@ -4,8 +4,6 @@ All features are integers. Sums of them are exact in double precision, so that t
 and parts of the samples may lie in files.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -94,8 +92,7 @@ def _usual(values: np.ndarray) -> np.ndarray:
     """[m] bool, False for outliers."""
     sizes = np.abs(values)
     last = len(sizes) - 1 - _rare(len(sizes))
-    usual: np.ndarray = sizes <= _FAR * np.partition(sizes, last)[last] + _FAR * 256
-    return usual
+    return sizes <= _FAR * np.partition(sizes, last)[last] + _FAR * 256
 
 
 def _alphabet(symbols: np.ndarray) -> tuple[int, int, int]:
@@ -115,8 +112,7 @@ def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
     ordered = np.sort(values)
     cuts = ordered[len(ordered) * np.arange(1, count) // count]
     cuts = np.unique(cuts[cuts > ordered[0]])
-    kept: np.ndarray = np.clip(cuts, -(2**31), 2**31 - 1).astype(np.int32)
-    return kept
+    return np.clip(cuts, -(2**31), 2**31 - 1).astype(np.int32)
 
 
 class _LeastSquares:
@@ -143,8 +139,7 @@ class _LeastSquares:
         for part, small in self._small():
             right += small @ np.rint(target[part][self.usual[part]] * scale)
         weights = _solve(self.normal, right) * self.scales / scale
-        rounded: np.ndarray = np.clip(np.rint(weights * 256), -32767, 32767).astype(np.int16)
-        return rounded
+        return np.clip(np.rint(weights * 256), -32767, 32767).astype(np.int16)
 
 
 def _scale(values: np.ndarray) -> float:

@@ -1,24 +1,23 @@
 """Read a version 2 file as a scene; chunks are decoded when they are read, and the last one is kept."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from flexgs_edge.codec.sections import ChunkEntry
-from flexgs_edge.codec.v2.chunk_plan import Chunk
 from flexgs_edge.codec.v2.container import GridContainer
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel, RowSteps
 from flexgs_edge.codec.v2.device.launch import Device
+from flexgs_edge.codec.v2.header import Chunk
 from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import CODES, GridScene
 from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
@@ -76,23 +75,12 @@ class GridSource(SceneSource):
         if not parts:
             return self._scene(Chunk(0, 0, 0), _nothing(self.sh_degree))
 
-        def joined(name: str) -> np.ndarray:
-            return np.concatenate([getattr(part, name) for part in parts], axis=-1)
-
-        return GridScene(
-            self.count,
-            self.sh_degree,
-            self.origin,
-            self.container.header.grid_steps,
-            joined("position"),
-            joined("scale"),
-            joined("rotation"),
-            joined("opacity"),
-            joined("dc"),
-            joined("sh_degrees"),
-            tuple(np.concatenate(bands, axis=1) for bands in zip(*(part.sh for part in parts), strict=True)),
-            joined("layer"),
-        )
+        names = (*CODES, "sh_degrees", "layer")
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names
+        }
+        bands = zip(*(part.sh for part in parts), strict=True)
+        return replace(parts[0], count=self.count, sh=tuple(np.concatenate(band, axis=1) for band in bands), **joined)
 
     def read(self, rows: Rows, fields: Sequence[str], out: Planes | None = None) -> Planes:
         """See `SceneSource.read`; a chunk is decoded as a whole, but without its SH if they are not asked for."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from flexgs_edge.codec.header import (
+from flexgs_edge.codec.sections import (
     MAX_COUNT,
     PREAMBLE_BYTES,
     HeaderError,
@@ -19,7 +19,7 @@ from flexgs_edge.codec.header import (
     parse_json,
     shown,
 )
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
+from flexgs_edge.codec.v2.rans import StreamError
 from flexgs_edge.constants import CODE_LIMIT, MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
@@ -33,20 +33,11 @@ PREVIEW_MOST = 1 << 24
 PREVIEW_KEY = len(',"preview_bytes":16777216')
 """Most bytes of a preview, and most bytes by which it makes the header longer."""
 _KEYS = (
-    "chunk_rows",
-    "count",
-    "cut_from",
-    "depth",
-    "layers",
-    "low",
-    "model_bytes",
-    "origin",
-    "settings",
-    "sh_degree",
+    "chunk_rows", "count", "cut_from", "depth", "layers", "low", "model_bytes", "origin", "settings", "sh_degree",
     "steps",
-)
+)  # fmt: skip
 _OPTIONAL = "channels", "preview_bytes"
-__all__ = ["GridHeader", "decode_header", "encode_header", "least_bytes"]
+CHUNK_ROWS = 65536
 
 
 @dataclass(frozen=True)
@@ -73,10 +64,7 @@ def channel_parts(sh_degree: int) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class GridHeader:
-    """The header of a version 2 file.
-
-    `count`, `sh_degree`: as in `GridScene`.
-    """
+    """The header of a version 2 file. `count`, `sh_degree`: as in `GridScene`."""
 
     count: int
     sh_degree: int
@@ -112,19 +100,9 @@ class GridHeader:
         x, y, z = (float(value) for value in grid.origin)
         a, b, c = (int(value) for value in low)
         header = cls(
-            grid.count,
-            grid.sh_degree,
-            (x, y, z),
-            grid.step_sizes.to_json(),
-            tuple(int(rows) for rows in layers),
-            chunk_rows,
-            depth,
-            (a, b, c),
-            model_bytes,
-            dict(settings),
-            channels=channels,
-            preview_bytes=preview_bytes,
-        )
+            grid.count, grid.sh_degree, (x, y, z), grid.step_sizes.to_json(), tuple(int(rows) for rows in layers), chunk_rows,
+            depth, (a, b, c), model_bytes, dict(settings), channels=channels, preview_bytes=preview_bytes,
+        )  # fmt: skip
         return header.sealed()
 
     def sealed(self) -> GridHeader:
@@ -277,3 +255,33 @@ def _integers(name: str, value: object, lowest: int, highest: int) -> tuple[int,
     if not isinstance(value, list):
         raise HeaderError(f"{name}: wanted a list of integers, got {shown(value)}")
     return tuple(checked_integer(name, number, lowest, highest) for number in value)
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Rows [start, stop) of a scene, all in one layer."""
+
+    layer: int
+    start: int
+    stop: int
+
+
+def plan_chunks(layers: list[int], chunk_rows: int = CHUNK_ROWS) -> list[Chunk]:
+    """The chunks of a scene, from the number of rows in each layer."""
+    chunks, at = [], 0
+    for layer, count in enumerate(layers):
+        for start in range(at, at + count, chunk_rows):
+            chunks.append(Chunk(layer, start, min(start + chunk_rows, at + count)))
+        at += count
+    return chunks
+
+
+def least_bytes(rows: int) -> int:
+    """Least bytes of a chunk of so many rows: a bit a row, rounded up to an even number."""
+    return -(-rows // 16) * 2
+
+
+def check_end(data: bytes, rows: int, used: int) -> None:
+    """Raise `StreamError` unless `used` bytes are the whole stream, or only zeros pad it to the least size of a chunk."""
+    if any(data[used:]) or (len(data) > used and len(data) != least_bytes(rows)):
+        raise StreamError(f"stream: wanted {used} bytes, got {len(data)}")

@@ -1,14 +1,11 @@
 """Code positions as an octree: one byte a node tells which of its children are occupied, level by level from the root."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 
 from flexgs_edge.constants import CHILD_CLASSES, LEVEL_CLASSES
 from flexgs_edge.grid.step_sizes import POSITION_BITS
-from flexgs_edge.scene.curve import morton
 
 CONTEXTS = LEVEL_CLASSES * CHILD_CLASSES
 
@@ -55,13 +52,13 @@ def _occupancy(cells: np.ndarray, level: int) -> np.ndarray:
     parents = children >> _THREE
     starts = np.flatnonzero(np.diff(parents, prepend=~parents[:1]))
     bits = np.uint8(1) << (children & np.uint64(7)).astype(np.uint8)
-    occupancy: np.ndarray = np.bitwise_or.reduceat(bits, starts)
-    return occupancy
+    return np.bitwise_or.reduceat(bits, starts)
 
 
 def unmorton(index: np.ndarray) -> np.ndarray:
-    """[3, n] i32: inverse of `flexgs_edge.grid.to_grid.morton`.
+    """[3, n] i32: inverse of `flexgs_edge.scene.curve.morton`.
 
+    >>> from flexgs_edge.scene.curve import morton
     >>> unmorton(morton(np.array([[1, 0], [0, 0], [0, 3]]))).tolist()
     [[1, 0], [0, 0], [0, 3]]
     """
@@ -83,6 +80,3 @@ def _gather(bits: np.ndarray) -> np.ndarray:
     ):
         bits = (bits | bits >> np.uint64(shift)) & np.uint64(mask)
     return bits
-
-
-__all__ = ["CONTEXTS", "TooManyNodes", "morton", "unmorton", "walk_octree"]

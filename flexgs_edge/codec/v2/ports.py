@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flexgs_edge.codec.v2 import octree
-from flexgs_edge.codec.v2.features import Sums, Term
 from flexgs_edge.codec.v2.fit_groups import Sample
-from flexgs_edge.codec.v2.groups import Group, GroupKind
+from flexgs_edge.codec.v2.groups import Group, GroupKind, Sums, Term
 from flexgs_edge.codec.v2.model import REPEATS_MOST, SHARED, Model
 from flexgs_edge.codec.v2.rans import Decoder, StreamError, Tables
 from flexgs_edge.constants import CODE_LIMIT

@@ -5,8 +5,6 @@ symbols starts at lane 0 and goes round the lanes. One vector operation moves al
 overhead is paid once a round.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -41,10 +39,7 @@ class StreamError(ValueError):
 
 
 class Tables:
-    """Frequency tables of one alphabet.
-
-    `freqs`: [t, a] integers: t tables of a <= 2^16 symbols. Every row adds up to 2^14.
-    """
+    """Frequency tables of one alphabet. `freqs`: [t, a] integers: t tables of a <= 2^16 symbols. Every row adds up to 2^14."""
 
     def __init__(self, freqs: np.ndarray) -> None:
         self.freqs = np.ascontiguousarray(freqs, np.uint32)
@@ -91,10 +86,7 @@ class Tables:
 
 
 class Encoder:
-    """Collects batches of symbols in decoding order, and codes them backwards.
-
-    `lanes`: from `lane_count`.
-    """
+    """Collects batches of symbols in decoding order, and codes them backwards. `lanes`: from `lane_count`."""
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes

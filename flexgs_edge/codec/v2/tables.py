@@ -1,7 +1,5 @@
 """Store frequency tables in a file: frequencies are rounded to few levels, and coded with the table before as context."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Code chunks and fit groups in parallel threads: none needs another, and NumPy releases the interpreter's lock."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable

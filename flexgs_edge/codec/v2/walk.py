@@ -3,16 +3,13 @@
 A port codes the batches. Encoding ports are given the codes; a decoding port returns them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from flexgs_edge.codec.v2.features import Features, Term
-from flexgs_edge.codec.v2.groups import GroupKind
+from flexgs_edge.codec.v2.groups import Features, GroupKind, Term
 from flexgs_edge.codec.v2.octree import unmorton, walk_octree
 from flexgs_edge.codec.v2.rans import StreamError
 from flexgs_edge.constants import COARSE_ROWS, VALUE_LIMIT
@@ -21,7 +18,6 @@ REACH = (4, 2)
 """Neighbours on each side: for base channels, then for SH. SH have many channels, so they take fewer neighbours, which
 saves time and costs few bits: docs/results/tuning.md#codec"""
 ONE = 256  # Features are integers in units of 1/256 of a code
-AXES = ("x", "y", "z")
 COLOURS = ("Y", "Co", "Cg")
 _OWN = 3  # Number of features from the channel's own neighbours: mean, spread and distance
 _NEAR = (2,)  # Place of the distance's weight
@@ -106,10 +102,7 @@ def plan_passes(position: np.ndarray, reach: int, stride: int = 1) -> Plan:
 
 
 def _neighbours(known: np.ndarray, count: int, reach: int, stride: int) -> np.ndarray:
-    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1.
-
-    The ends are repeated.
-    """
+    """[2 * reach, count], the neighbours of `count` rows: row j lies between `known` j and j + 1. The ends are repeated."""
     padded = np.concatenate([np.repeat(known[:1], reach - 1), known, np.repeat(known[-1:], reach)])
     # Overlapping views of one array; as_strided does the same, but slowly.
     step = padded.itemsize
@@ -176,10 +169,7 @@ class ChunkCodes:
 
 
 class Port(Protocol):
-    """Codes batches for `walk_chunk`; `codes` and `symbols` are None to decode.
-
-    The port chooses the type `known` returns.
-    """
+    """Codes batches for `walk_chunk`; `codes` and `symbols` are None to decode. The port chooses the type `known` returns."""
 
     stride: int  # One in so many rows of each pass is coded
 

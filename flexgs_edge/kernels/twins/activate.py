@@ -1,7 +1,5 @@
 """Twin of `cl_kernels/activate.cl`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import ALPHA_MIN, FACTOR_MIN, LOG2_E

@@ -1,7 +1,5 @@
 """The arithmetic of `cl_kernels/common.clh` in NumPy, bit for bit: fma, exp2, log2, dot products, all in float32."""
 
-from __future__ import annotations
-
 from typing import Any, Union
 
 import numpy as np
@@ -52,8 +50,7 @@ def fexp2_within(x: Array) -> Array:
     p = np.full_like(f, EXP2_POLY[-1])
     for coefficient in EXP2_POLY[-2::-1]:
         p = fma(p, f, f32(coefficient))
-    power: Array = (p.view(np.int32) + i).view(f32)
-    return power
+    return (p.view(np.int32) + i).view(f32)
 
 
 def flog2(x: Array) -> Array:

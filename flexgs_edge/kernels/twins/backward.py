@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/backward.cl`: gradients of stored values from a view's sums."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import FACTOR_MIN, FIXED_MOMENT, FIXED_WEIGHT, LOG2_E, SH_C0, SH_C1, SH_C2, SH_C3, SH_C4
@@ -110,8 +108,7 @@ def _pace(wide: float, cam: Array, means: Array, log_scales: Array) -> Array:
     px, py, pz = means
     iz = f32(1) / (fma(cam[8], pz, fma(cam[6], px, cam[7] * py)) + cam[11])
     size = fexp2(log_scales * f32(LOG2_E)).max(axis=0) * iz
-    share: Array = np.where(size > f32(wide), f32(wide) / size, f32(1))
-    return share
+    return np.where(size > f32(wide), f32(wide) / size, f32(1))
 
 
 def _colours(

@@ -3,8 +3,6 @@
 All 4x4 blocks of a group of tiles are blended at once: step k blends the k-th splat of every block that has one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 
@@ -68,8 +66,7 @@ def _fixed(lanes: Array, unit: float, tiles: int) -> Array:
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
-    fixed: Array = np.clip(total * f32(unit), -largest, largest).astype(np.int64)
-    return fixed
+    return np.clip(total * f32(unit), -largest, largest).astype(np.int64)
 
 
 PLANES = {

@@ -1,7 +1,5 @@
 """Twin of `cl_kernels/dequantize.cl`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.kernels.twins.arithmetic import Array, Size

@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/descend.cl`: steps of values along their gradients, and rounding to the grid."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import GRADIENT_MIN
@@ -11,8 +9,7 @@ from flexgs_edge.kernels.twins.backward import AT_DC, AT_LOGIT, AT_QUAT, AT_SCAL
 
 
 def _pull(away: Array, price: np.float32, width: np.float32) -> Array:
-    pulled: Array = price * away / (np.abs(away) + width)
-    return pulled
+    return price * away / (np.abs(away) + width)
 
 
 def price_bits(degree: int, prices: Array, degrees: Array, pace: Array, values: Array, gradient: Array) -> None:
@@ -98,10 +95,7 @@ def snap(
     sh_dc: Array,
     sh_rest: Array,
 ) -> None:
-    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to.
-
-    A step of 0 leaves them as they are.
-    """
+    """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to. A step of 0 leaves them as they are."""
     means[:] = _on_grid(values[:AT_SCALE], steps[0])
     log_scales[:] = _on_grid(values[AT_SCALE:AT_QUAT], steps[1])
     w, x, y, z = values[AT_QUAT:AT_LOGIT]

@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/flip.cl`: LDR-FLIP of two pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import (

@@ -1,7 +1,5 @@
 """Twin of `cl_kernels/project.cl`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -71,8 +69,7 @@ def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
 def block_rows(blocks: Array, first: int, count: int) -> Array:
     """[count] i64, the rows of a chunk in its part of a view: those of `blocks` from place `first` on."""
     some = blocks[first : first - (-count // ROW_BLOCK)].astype(np.int64)
-    rows: Array = (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
-    return rows
+    return (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
 
 
 def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tuple[Array, Array, Array, Array]:

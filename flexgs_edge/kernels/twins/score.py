@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/score.cl`: residual images, costs of removal and of dropped SH degrees, and sums of the colour refit."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import FIXED_ERROR, FIXED_LARGEST, FIXED_WEIGHT, SH_C0

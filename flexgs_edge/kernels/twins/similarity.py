@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/similarity.cl`: SSIM of two one-channel images."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import SSIM_C1, SSIM_C2, SSIM_WINDOW
@@ -39,8 +37,7 @@ def ssim_rows(size: Size, count: int, plane: int, taps: Array, moments: Array, s
 def _shown(values: Array) -> Array:
     """Clamped to [0, 1]; NaN gives 0."""
     above = np.where(values > 0, values, f32(0))
-    shown: Array = np.where(above < 1, above, f32(1))
-    return shown
+    return np.where(above < 1, above, f32(1))
 
 
 def dssim_slopes(

@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/sort.cl`: a stable radix sort by blocks, pass by pass."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import CULLED

@@ -1,7 +1,5 @@
 """Twins of `cl_kernels/tiles.cl`: tile lists in depth order, with block masks."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flexgs_edge.constants import BLOCK, SPAN_SLACK, SPAN_SLACK_RELATIVE, TILE
@@ -37,8 +35,7 @@ def _tile_masks(first: Array, last: Array, column: Array) -> Array:
     """[m] u32, blocks of tiles in columns of tiles ([m]), bit 4 * row + column, from the spans of their rows ([m, 4])."""
     start, end = np.maximum(first - 4 * column[:, None], 0), np.minimum(last - 4 * column[:, None], 3)
     bits = ((1 << (np.clip(end, 0, 3) + 1)) - 1) & ~((1 << np.clip(start, 0, 4)) - 1)
-    masks: Array = np.where(start <= end, bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
-    return masks
+    return np.where(start <= end, bits << (4 * _BANDS), 0).sum(axis=1).astype(np.uint32)
 
 
 def only_tiles(records: Array, column: Array, row: Array, width: np.float32) -> Array:
@@ -46,8 +43,7 @@ def only_tiles(records: Array, column: Array, row: Array, width: np.float32) -> 
     column, row = column.astype(np.int32), row.astype(np.int32)
     first, last = block_spans(records, row[:, None] * (TILE // BLOCK) + _BANDS, width)
     number = (row * np.int32(-(-int(width) // TILE)) + column).astype(np.uint32)
-    words: Array = number << np.uint32(16) | _tile_masks(first, last, column)
-    return words
+    return number << np.uint32(16) | _tile_masks(first, last, column)
 
 
 def _expand(first: Array, last: Array) -> tuple[Array, Array]:

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.errors import BudgetError, InputError
-from flexgs_edge.files import DISK_FULL
+from flexgs_edge.errors import DISK_FULL, BudgetError, InputError
 from flexgs_edge.memory.rows import blocks, read_rows
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.effort import effort_of, finetune_steps
@@ -137,7 +136,7 @@ def open_checkpoint(
     options = run.options
     # Rounds that lead to a descent also keep references from between the scored poses.
     steps = finetune_steps(options, len(scored), run.source.count, fine=is_fine(options, run.source))
-    plan = effort_of(options)
+    plan = effort_of(run)
     words = f"path {plan.keep!r} {options.refit} {options.unseen_share!r} {renderer.background!r} {steps > 0}"
     if steps and plan.interleaved:
         # The target says between which rounds a descent comes.

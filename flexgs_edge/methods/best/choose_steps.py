@@ -31,9 +31,6 @@ GEOMETRY = {
 SMALLEST_THREE = 1.051
 """Mean square error of a rotation over that of its three stored components. The fourth component follows from these, so
 its error adds up: the mean of 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
-GEOMETRY_REFITTED = 2.0
-"""Factor on squared errors of geometry: the colour refit that follows takes back about half of them:
-docs/results/tuning.md#geometry_refitted"""
 CHROMA = 2.0
 """Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
 So equal slopes ask for sqrt(6) and 2."""
@@ -50,7 +47,7 @@ class Slopes:
     def step(self, kind: str, multiplier: float) -> float:
         """The step size of `kind` for a multiplier."""
         slope = max(self.per_row[kind], 1e-30)
-        return math.sqrt(GEOMETRY_REFITTED * multiplier * GEOMETRY[kind][1] / (2 * math.log(2) * slope))
+        return math.sqrt(multiplier * GEOMETRY[kind][1] / (2 * math.log(2) * slope))
 
 
 def probe_slopes(

@@ -13,6 +13,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.run import Run
 
 LEAST_STEPS = 240
 """Least steps of a descent. Four rounds of a few poses mend less than they break: docs/results/tuning.md#least_steps"""
@@ -137,17 +138,22 @@ _BALANCED = Effort(
 )
 EFFORTS = {
     "fast": Effort(
-        keep=0.77, refit_rounds=0, subsets=7, close=0.3, near=0.1, few=32, views=96, pixels=12, refitted=0.93, probed=4
+        keep=0.77, refit_rounds=0, subsets=7, close=0.3, near=0.1, few=32, views=96, pixels=12, refitted=0.84, probed=4
     ),
     "balanced": _BALANCED,
     "max": _BALANCED,  # another word: more work gained less than a tenth on most scenes
 }
 
 
-def effort_of(options: CompressOptions) -> Effort:
-    """The effort of a run. Whoever sets the steps of a descent gets one descent for each candidate, and no others."""
-    plan = EFFORTS[options.effort]
-    return plan if options.distil is None else replace(plan, interleaved=0)
+def effort_of(run: Run[CompressOptions]) -> Effort:
+    """The effort of a run.
+
+    Whoever sets the steps of a descent gets one descent for each candidate, and no others. The same holds where automatic
+    views judge quality: from elsewhere, what was fine-tuned to them and then pruned by them loses more than they tell.
+    """
+    plan = EFFORTS[run.options.effort]
+    lone = run.seen.automatic and run.target.limit_bytes is None
+    return replace(plan, interleaved=0) if lone or run.options.distil is not None else plan
 
 
 def finetune_steps(options: CompressOptions, poses: int, count: int, fine: bool = False) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -23,32 +23,23 @@ from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, m
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import REACH, land, land_on_quality
 from flexgs_edge.methods.best.refit.colour import refit_colours
-from flexgs_edge.methods.best.refit.finetune import Schedule, finetune, share_of_margin, structure_of
+from flexgs_edge.methods.best.refit.finetune import Schedule, finetune, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import Candidate
-from flexgs_edge.methods.best.selection import PRUNED_PART, Guess, Kept, Measure, Selection
+from flexgs_edge.methods.best.search import LARGEST_STRIDE, SLOPE, Candidate, next_point
+from flexgs_edge.methods.best.selection import Guess, Kept, Measure, Selection
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
-DISTILLED = 0.3
-"""Expected loss after a descent, divided by the loss before it, where no descent came between the rounds:
-docs/results/tuning.md#distilled"""
-BEHIND = 0.03
-"""Log of the loss after a first candidate's descent over the middle of what the last descent between rounds left and of the
-probe: docs/results/tuning.md#distilled"""
-BEHIND_MARGIN = -0.09
-"""What a full margin of SSIM adds to `BEHIND`, as descents then weigh structure more: docs/results/tuning.md#behind_led"""
+DISTILLED = 0.36
+"""Expected loss after the first descent, divided by the loss before it: docs/results/tuning.md#distilled. Later ones end half
+way, as logs, between the loss before them and the one that the descent before left."""
 FULL_PASSES = 10
 """Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
 docs/results/tuning.md#full_passes"""
 FULL_RATES, LEAST_RATE = 41.0, 0.25
 """Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
-PRUNED_DISTILLED = 1.6
-"""`PRUNED_PART` if a descent follows. It is above 1: a descent wins back more than pruning lost beyond the target."""
-INTERLEAVED = 0.8
-"""Pruning stops for a descent at this share of the loss that the target allows, and the first candidate comes once two descents
-in a row leave more than it:
-docs/results/tuning.md#interleaved"""
+PROBED_FROM = -1.2
+"""Rounds of pruning make the grid of their cut once the last snapshot is this near to a miss, as the log of the share."""
 MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
 """With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
 many; and most descents: docs/results/tuning.md#interleaved"""
@@ -78,32 +69,6 @@ def rate_from(fidelity: float) -> float:
     With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
     """
     return max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
-
-
-@dataclass(frozen=True)
-class Descents:
-    """The descents of a search."""
-
-    steps: int  # of the descent to a candidate; 0 for none
-    poses: int  # scored poses
-    ssim_margin: float = 0.0  # by how much SSIM is nearer to its bound than the mean, as for `structure_of`
-
-    @property
-    def passes(self) -> float:
-        """Steps of the descent to a candidate for each scored pose."""
-        return self.steps / self.poses
-
-    def schedule(self, share: float, fidelity: float, last: float = Schedule.last, multiplier: float = 0.0) -> Schedule:
-        """A descent with `share` of a candidate's steps, from planes of this fidelity."""
-        rate = min(math.sqrt(FULL_PASSES / self.passes), 1.0) * rate_from(fidelity)
-        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier)
-
-    def after(self, excess: float, left: float | None = None) -> float:
-        """Expected excess after a first candidate's descent, from that before it, and from that which the descent before left."""
-        if left is None:
-            return excess + math.log(DISTILLED)
-        behind = BEHIND + BEHIND_MARGIN * share_of_margin(self.ssim_margin)
-        return (left + excess) / 2 + behind
 
 
 Choose = Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
@@ -142,16 +107,13 @@ class GridMaker:
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
         self._guess = Guess(measure)
+        self._mends = math.log(DISTILLED)  # by how much a first descent changes the excess; measured, if one is undone
         self._left: dict[int, float] = {}  # Excess that the descent to a snapshot left, by the snapshot's number
 
     def start(self, target: Target) -> float:
-        """Prune and descend in turn, then prune until pruning alone loses its share; returns the multiplier of that cut."""
+        """Prune and descend in turn, then prune until a candidate is expected to miss."""
         self._interleave(target)
-        self._guess.prune(self.selection, target, PRUNED_DISTILLED if self.steps else PRUNED_PART)
-        multiplier = self.selection.cut()
-        if target.limit_bytes is None:
-            self._guess.learn(values_of(self._before_refit(multiplier), self.rounds.storage), target)
-        return multiplier
+        return self._prune(target)
 
     def probe(self, multiplier: float, target: Target) -> float:
         """See `Maker`: of the grid of a multiplier, without a refit or a descent of its own."""
@@ -167,14 +129,16 @@ class GridMaker:
         by_size = target.limit_bytes is not None
         grid = self._finetuned(kept, step_sizes, multiplier) if self.steps else self._finish(kept, step_sizes)
         candidate, grid = self._measured(grid, multiplier, target, started, kept.left_out)
-        if not (self.steps and self.refit) or by_size or self._is_file or candidate.excess <= 0.0:
+        if candidate.excess <= 0.0 or by_size:
             return candidate, grid
-        before = self._guess(values_of(self._before_refit(multiplier), self.rounds.storage), target)
-        if before > candidate.excess:
-            return candidate, grid
-        self.steps, self.selection.begin = 0, 0
-        kept, step_sizes = self._choice(multiplier)
-        return self._measured(self._finish(kept, step_sizes), multiplier, target, started, kept.left_out)
+        if self.steps and self.refit and not self._is_file:
+            before = self._guess(self._grid_values(multiplier), target)
+            if before <= candidate.excess:
+                self.steps, self.selection.begin = 0, 0
+                kept, step_sizes = self._choice(multiplier)
+                return self._measured(self._finish(kept, step_sizes), multiplier, target, started, kept.left_out)
+        self.selection.missed(kept)
+        return candidate, grid
 
     def trim(
         self, chosen: Candidate, product: GridScene, target: Target, tell: Callable[[Candidate], None], most: int
@@ -215,33 +179,56 @@ class GridMaker:
         """Grids go by themselves."""
 
     def _interleave(self, target: Target) -> None:
-        """Prune and descend in turn, until descents mend too little, or as few Gaussians are left as a size asks for.
+        """Prune and descend in turn, as often as the effort says.
 
-        A descent that makes the views that decide worse is undone. If it is the first one, colours are refitted instead of
-        all further descents.
+        A descent that makes the views that decide worse, or leaves more than the target allows, is undone. If the first one makes
+        them worse, colours are refitted instead of all further descents.
         """
-        by_size, after = target.limit_bytes is not None, -math.inf
+        by_size = target.limit_bytes is not None
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
-            self._guess.prune(self.selection, target, INTERLEAVED, fit)
-            kept = self.selection.kept(self.selection.cut())  # half a round more
+            kept = self.selection.kept(self._prune(target, fit))
             pruned = self._fidelity(kept.planes)
-            schedule = self._descents.schedule(INTERLEAVED_SHARE, pruned, last=INTERLEAVED_LAST)
+            schedule = self._schedule(INTERLEAVED_SHARE, pruned, last=INTERLEAVED_LAST)
             self.rounds.renew(partial(self._off_grid, kept, schedule))
-            if self._fidelity(self.selection.last.planes) < pruned:
+            self._slopes, planes, number = None, self.selection.last.planes, len(self.rounds.snapshots) - 1
+            worse = self._fidelity(planes) < pruned
+            if not by_size:
+                self._guess.learn(planes, target)
+                self._left[number] = self._guess(planes, target)
+            if worse or self._left.get(number, -math.inf) >= 0.0:
+                if number in self._left:
+                    self._mends = min(self._left.pop(number) - self._guess(kept.planes, target), 0.0)
                 self.rounds.undo()
-                if self.selection.begin == 0:
+                if worse and self.selection.begin == 0:
                     self.steps = 0
                 break
-            before = after
-            if not by_size:
-                planes = self.selection.last.planes
-                self._guess.learn(planes, target)
-                after = self._guess(planes, target)
-                self._left[len(self.rounds.snapshots) - 1] = after
-            self.selection.begin = len(self.rounds.snapshots) - 1
-            # One alone may leave more by chance.
-            if min(before, after) >= math.log(INTERLEAVED):
-                break
+            self.selection.begin = number
+
+    def _prune(self, target: Target, fit: float = 1.0) -> float:
+        """Prune until a candidate is expected to miss, or until `fit` times the rows are left that a size allows.
+
+        Returns the multiplier of the candidate that is expected to hold just so.
+        """
+        limit, points = target.limit_bytes, []
+
+        def enough(last: Snapshot) -> bool:
+            if limit is not None:
+                return last.count * self.selection.bits.base / 8 <= fit * limit
+            # The grid of a cut loses more than the last snapshot. It is not made in rounds far from the answer.
+            if len(self.rounds.snapshots) == 1 or self._after(self._guess(last.planes, target)) < PROBED_FROM:
+                return False
+            multiplier = self.selection.cut()
+            points.append((math.log(multiplier), self.probe(multiplier, target)))
+            return points[-1][1] >= 0.0
+
+        self.selection.prune(enough)
+        if not points:
+            return self.selection.cut()
+        known = self._guess.ssim_margin
+        self._guess.learn(self._grid_values(math.exp(points[-1][0])), target)
+        self._slopes = None
+        more = self._guess.ssim_margin - known
+        return math.exp(next_point([(place, excess + more) for place, excess in points], SLOPE, LARGEST_STRIDE))
 
     def _off_grid(self, kept: Kept, schedule: Schedule) -> tuple[np.ndarray, Planes]:
         """Rows and planes after a descent off the grid."""
@@ -254,9 +241,13 @@ class GridMaker:
 
     def _after(self, excess: float) -> float:
         """Expected excess of a candidate after its refit or descent, from that before it."""
-        if self.steps:
-            return self._descents.after(excess, self._left.get(self.selection.begin))
-        return excess + (math.log(self.effort.refitted) if self.refit else 0.0)
+        if not self.steps:
+            return excess + (math.log(self.effort.refitted) if self.refit else 0.0)
+        left = self._left.get(self.selection.begin)
+        return excess + self._mends if left is None else (left + excess) / 2
+
+    def _grid_values(self, multiplier: float) -> Planes:
+        return values_of(self._before_refit(multiplier), self.rounds.storage)
 
     def _before_refit(self, multiplier: float) -> GridScene:
         kept, step_sizes = self._choice(multiplier)
@@ -289,9 +280,7 @@ class GridMaker:
         As in `_finish`, copies go as soon as they can, those of `kept` as well: a large scene has no room for all of them.
         """
         worth = 0.0 if self._fixed_rows else multiplier
-        moved = self._finetune(
-            kept, self._descents.schedule(1.0, self._fidelity(kept.planes), multiplier=worth), step_sizes
-        )
+        moved = self._finetune(kept, self._schedule(1.0, self._fidelity(kept.planes), multiplier=worth), step_sizes)
         kept.planes = {}
         grid, _ = self._to_grid(moved, kept.degrees, holdable(step_sizes, moved))
         del moved
@@ -356,9 +345,13 @@ class GridMaker:
             costs = measure_costs(original.renderer, scene, original.cameras, sh_costs=False)
         return np.where(costs.weight2 > 0, costs.removal, np.inf)
 
-    @property
-    def _descents(self) -> Descents:
-        return Descents(self.steps, len(self.rounds.original.cameras), self._guess.ssim_margin)
+    def _schedule(
+        self, share: float, fidelity: float, last: float = Schedule.last, multiplier: float = 0.0
+    ) -> Schedule:
+        """A descent with `share` of a candidate's steps, from planes of this fidelity."""
+        passes = self.steps / len(self.rounds.original.cameras)
+        rate = min(math.sqrt(FULL_PASSES / passes), 1.0) * rate_from(fidelity)
+        return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier)
 
     def _finetune(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
         """A descent; where colours are clipped after it, a second one lets the other values make up for that."""

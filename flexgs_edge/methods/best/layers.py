@@ -21,8 +21,7 @@ from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.growth import growth
-from flexgs_edge.scene.source import MemorySource
+from flexgs_edge.scene.source import MemorySource, growth
 
 HALF = 0.485
 """Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other

@@ -39,7 +39,7 @@ from flexgs_edge.render.fit import (
 )
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.view_buffers import view_size
-from flexgs_edge.run.foresight import drawing_bytes, shown_rows, size_of
+from flexgs_edge.run.open_renderer import drawing_bytes, shown_rows, size_of
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD

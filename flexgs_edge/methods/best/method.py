@@ -39,16 +39,15 @@ from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import decoded
 from flexgs_edge.run.evaluators import Evaluators
-from flexgs_edge.run.method_result import MethodResult
+from flexgs_edge.run.few_poses import usual_depth
+from flexgs_edge.run.method_result import MethodResult, make_settings, settings_room
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
 from flexgs_edge.run.run import Run
-from flexgs_edge.run.settings import make_settings, settings_room
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 
 See = Callable[[Sequence[int], int], bool]
 MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
@@ -75,7 +74,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
                 kept = open_checkpoint(run, renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
         coder = GridCoder(renderer, settings_room(run))
-        maker = grid_maker(run.options, coder)
+        maker = grid_maker(run, coder)
         grid, search = search_best(maker, run, renderer, poses, judges.decide, checkpoint=kept)
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
@@ -157,17 +156,17 @@ def _tried(
     return size, judges.measure(MemorySource(values_of(grid, judges.storage), origin=grid.origin))
 
 
-def grid_maker(options: CompressOptions, coder: GridCoder) -> MakerOf[GridScene]:
+def grid_maker(run: Run[CompressOptions], coder: GridCoder) -> MakerOf[GridScene]:
     """Make makers of the grid of a `.fgs`."""
 
     def size_of(grid: GridScene) -> int:
-        return projected_size(options, coder.size(grid))
+        return projected_size(run.options, coder.size(grid))
 
-    plan = effort_of(options)
+    plan = effort_of(run)
 
     def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:
-        maker = GridMaker(rounds, size_of, measure, plan, options.refit, rounds.original.steps, see)
-        maker.selection.most = options.max_gaussians
+        maker = GridMaker(rounds, size_of, measure, plan, run.options.refit, rounds.original.steps, see)
+        maker.selection.most = run.options.max_gaussians
         return maker
 
     return make
@@ -204,6 +203,7 @@ def search_best(
     """
     source, options, target = run.source, run.options, run.target
     plan = MemoryPlan.of(run, renderer, poses.cameras)
+    depth = usual_depth(renderer, source, poses.cameras) if plan.steps else 1.0
     run.budget.require("a search by measured costs", plan.held + plan.least)
     run.budget.take("the scene and its search", plan.held)
     further = 0
@@ -227,7 +227,9 @@ def search_best(
             between = poses_between(poses.cameras) if plan.steps else ()
             turns = poses.known.slopes([*poses.cameras, *between]) if poses.known and plan.steps else None
             rounds = PruneRounds(
-                Original(renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns),
+                Original(
+                    renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns, depth
+                ),
                 source,
                 refit=options.refit,
                 unseen_share=options.unseen_share,

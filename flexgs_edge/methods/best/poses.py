@@ -15,10 +15,9 @@ from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
 from flexgs_edge.quality.psnr import contrast, far_bases, mse, mse_of_psnr
 from flexgs_edge.render.renderer import Renderer
+from flexgs_edge.run.few_poses import visible_depths
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
-from flexgs_edge.scene.lower_sh import without_degrees
-from flexgs_edge.scene.source import SceneSource, some_positions
-from flexgs_edge.views.depths import visible_depths
+from flexgs_edge.scene.source import SceneSource, some_positions, without_degrees
 
 LEAST = 1e-6  # Least weight of a pose
 STEP = 4  # Every fourth pixel in both directions is compared

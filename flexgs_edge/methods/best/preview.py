@@ -29,10 +29,9 @@ from flexgs_edge.methods.best.refit.finetune import Schedule, finetune
 from flexgs_edge.methods.best.rounds import take_rows
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.scene.growth import growth
-from flexgs_edge.scene.source import MemorySource, Planes
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.run.few_poses import usual_depth
+from flexgs_edge.scene.source import MemorySource, Planes, growth
+from flexgs_edge.views.references import Original, References
 
 LEAST_PREVIEWED, PREVIEW_SHARE = 1_000_000, 0.02
 """Where nothing is said, files from so many bytes on get a preview, of this share of their bytes. A smaller file comes within a
@@ -120,7 +119,8 @@ def _original(
     with renderer.load(MemorySource(planes, origin=origin)) as scene:
         for view, camera in enumerate(renderer.in_turn(scene, some)):
             references.add(view, renderer.render_planes(scene, camera))
-    return Original(renderer, origin, some, references, progress=progress)
+    depth = usual_depth(renderer, MemorySource(planes, origin=origin), some)
+    return Original(renderer, origin, some, references, progress=progress, depth=depth)
 
 
 def _coarser(camera: Camera) -> Camera:

@@ -34,7 +34,7 @@ from flexgs_edge.scene.check import alive, invisible
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, read_all
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 from flexgs_edge.views.sums import ViewSums
 
 PARTS = 2

@@ -36,7 +36,7 @@ CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than thi
 LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
-def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.2) -> float:
+def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.5) -> float:
     """Position where the excess should be just below zero: false position, kept away from measured points.
 
     `points`: (position, excess) of the measured points, at least one. `slope`: excess per position, used before two

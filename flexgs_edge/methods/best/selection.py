@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -21,11 +20,7 @@ from flexgs_edge.scene.source import Planes
 MOST_ROUNDS = 24  # Most rounds of pruning
 FEW = 16  # Of fewer Gaussians none goes in a round
 ALL_LEFT = 0.97
-"""A multiplier that keeps this share of what a descent has left asks for more: it chooses from what the descent before left."""
-MARGIN_FROM = 1.0
-"""Rounds of pruning measure SSIM once, as soon as the log of the loss is this near to their end: docs/results/tuning.md#lead"""
-PRUNED_PART = 0.45
-"""Share of the allowed loss that pruning alone uses up when a candidate meets the target: docs/results/tuning.md#pruned_part"""
+"""A candidate that missed with this share of what a descent has left asks for more: see `Selection.missed`."""
 
 
 @dataclass
@@ -60,6 +55,7 @@ class Selection:
     bits: BitModel  # bits of a Gaussian by SH degree
     most: int | None = None  # most Gaussians (`--max-gaussians`)
     begin: int = 0  # snapshots before this one do not count: a descent has changed all costs since
+    missed_once: set[int] = field(default_factory=set)  # snapshots of which a candidate with about all rows missed
 
     @property
     def last(self) -> Snapshot:
@@ -83,14 +79,24 @@ class Selection:
     def kept(self, multiplier: float) -> Kept:
         """The rows that a multiplier keeps."""
         index, keep, degrees = self._chosen(multiplier)
-        while index == self.begin > 0 and keep.mean() >= ALL_LEFT:
-            self.begin = max((number for number in self.rounds.renewed if number < self.begin), default=0)
-            index, keep, degrees = self._chosen(multiplier)
         snapshot = self.rounds.snapshots[index]
         rows, storage = np.flatnonzero(keep), self.rounds.storage
         planes = drop_bands(snapshot.planes, rows, degrees[rows], snapshot.costs.sh_mean, SH_C0, storage)
         weight2 = storage.take(snapshot.costs.weight2, rows)
         return Kept(index, storage.take(snapshot.rows, rows), planes, degrees[rows], weight2)
+
+    def missed(self, kept: Kept) -> None:
+        """Tell of a candidate that missed.
+
+        If it has about all that a descent left, a finer grid may do. After the second such miss, rows are chosen from what the
+        descent before left.
+        """
+        begin = self.begin
+        if kept.snapshot != begin or len(kept.rows) < ALL_LEFT * self.rounds.snapshots[begin].count:
+            return
+        if begin in self.missed_once:
+            self.begin = max((number for number in self.rounds.renewed if number < begin), default=0)
+        self.missed_once.add(begin)
 
     def _chosen(self, multiplier: float) -> tuple[int, np.ndarray, np.ndarray]:
         for index in range(self.begin, self.begin + MOST_ROUNDS + 1):
@@ -131,20 +137,3 @@ class Guess:
         if bounds_ssim(target):
             quality = self._measure(planes)
             self.ssim_margin = max(means(target).excess(0, quality) - mean_alone(target).excess(0, quality), 0.0)
-
-    def prune(self, selection: Selection, target: Target, part: float, times: float = 1.0) -> None:
-        """Prune until pruning alone loses `part` of what the target allows, or `times` the rows are left that a size allows."""
-        rounds, limit, end = selection.rounds, target.limit_bytes, math.log(part)
-
-        def enough(last: Snapshot) -> bool:
-            if limit is not None:
-                return last.count * selection.bits.base / 8 <= times * limit
-            if len(rounds.snapshots) == 1:
-                return False
-            excess = self(last.planes, target)
-            if self.ssim_margin == 0.0 and excess >= end - MARGIN_FROM:
-                self.learn(last.planes, target)
-                excess += self.ssim_margin
-            return excess >= end
-
-        selection.prune(enough)

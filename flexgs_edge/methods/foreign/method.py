@@ -4,8 +4,6 @@ Pruning, fine-tuning and the grid are those of a `.fgs`, since values on a grid 
 those of the file.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from dataclasses import replace
@@ -37,10 +35,7 @@ from flexgs_edge.units import format_size
 
 
 def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResult:
-    """Compress a scene into a file of another program's format.
-
-    `run`: planned. `renderer`: draws the views.
-    """
+    """Compress a scene into a file of another program's format. `run`: planned. `renderer`: draws the views."""
     options, plan, output, format = run.options, run.plan, run.output.path, run.output.format
     # The plan has refused runs without views.
     assert renderer is not None and plan is not None and plan.target is not None and format is not None
@@ -53,7 +48,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
         with tempfile.TemporaryDirectory(prefix=".flexgs-", dir=beside) as folder:
             files = Files(run, format, Path(folder))
             LOG.info("searching for %s", plan.target.describe())
-            grid, search = search_best(file_maker(options, files), run, renderer, poses, judges.decide)
+            grid, search = search_best(file_maker(run, files), run, renderer, poses, judges.decide)
             judges.decided()
             file = files.of(grid)
             source = read_foreign(file)
@@ -112,7 +107,7 @@ class Files:
         return planes
 
 
-def file_maker(options: CompressOptions, files: Files) -> MakerOf[GridScene]:
+def file_maker(run: Run[CompressOptions], files: Files) -> MakerOf[GridScene]:
     """Make makers of grids that are written as files of another program's format."""
 
     def make(rounds: PruneRounds, measure: Measure, see: See | None = None) -> GridMaker:
@@ -121,8 +116,8 @@ def file_maker(options: CompressOptions, files: Files) -> MakerOf[GridScene]:
             rounds,
             files.size_of,
             measure,
-            effort_of(options),
-            options.refit,
+            effort_of(run),
+            run.options.refit,
             rounds.original.steps,
             see,
             lambda grid: files.decoded(grid, origin),
@@ -131,7 +126,7 @@ def file_maker(options: CompressOptions, files: Files) -> MakerOf[GridScene]:
             files.format.fixed_rows,
             files.format.most_colour,
         )
-        maker.selection.most = options.max_gaussians
+        maker.selection.most = run.options.max_gaussians
         return maker
 
     return make

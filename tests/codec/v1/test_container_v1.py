@@ -13,20 +13,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import educational_decoder
-import flexgs_edge.codec.v1.header as layout
+import flexgs_edge.codec.v1.container as layout
 from benchmarks.quantize import dequantized
 from fgs_damage import away
-from flexgs_edge.codec.header import canonical_json
-from flexgs_edge.codec.v1.container import read_header, verify, write_container
-from flexgs_edge.codec.v1.header import HEADER_OWN, Header, container_size, encode_header, header_block
+from flexgs_edge.codec.sections import canonical_json
+from flexgs_edge.codec.v1.container import (
+    HEADER_OWN,
+    Header,
+    container_size,
+    encode_header,
+    header_block,
+    read_header,
+    verify,
+    write_container,
+)
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.errors import InputError
-from flexgs_edge.packed.bitspec import PAPER, BitSpec
+from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.packed.quantize import dequantize
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 from quantized_scenes import assert_same_codes, make_scene, quantize_all
+from scene_files import open_scene
 
 NAMES = [field.name for field in FIELDS]
 GOLDEN = Path(__file__).parents[2] / "golden"
@@ -35,7 +43,7 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> int:
     """Chunks of 64 rows, so that many chunks cost little (the format's constant is checked by the golden file)."""
-    for module in ("header", "container", "packed_source"):
+    for module in ("container", "packed_source"):
         monkeypatch.setattr(f"flexgs_edge.codec.v1.{module}.CHUNK_ROWS", 64)
     return 64
 

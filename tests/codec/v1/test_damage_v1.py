@@ -26,7 +26,7 @@ from fgs_damage import (
 from flexgs_edge.codec.v1.container import read_header, verify, write_container
 from flexgs_edge.codec.v1.packed_source import FgsSource
 from flexgs_edge.errors import FormatError
-from flexgs_edge.packed.bitspec import BitSpec
+from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.scene.fields import FIELDS
 from quantized_scenes import make_scene, quantize_all
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexgs_edge.codec.v2.chunk_plan import CHUNK_ROWS
 from flexgs_edge.codec.v2.container import GridContainer, coded_size, decode_chunk, write_grid
 from flexgs_edge.codec.v2.device.decode_kernel import ChunkKernel
 from flexgs_edge.codec.v2.device.encode_kernels import device_bytes
 from flexgs_edge.codec.v2.device.launch import INFO, Device
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
+from flexgs_edge.codec.v2.header import CHUNK_ROWS
 from flexgs_edge.codec.v2.model import Model
 from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.commands.decompress import decompress
@@ -30,7 +30,7 @@ from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.run.clock import Stopwatch
+from flexgs_edge.progress import Stopwatch
 from flexgs_edge.run.decoding import DEVICE_ROWS, ahead, coding_device, decoder
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource

@@ -26,11 +26,11 @@ from flexgs_edge.errors import FormatError, InputError, TargetError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.values import from_grid
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.fields import FIELDS
 from grid_scenes import assert_same_grid, make_grid
 from quantized_scenes import make_scene, quantize_all
+from scene_files import open_scene
 
 NAMES = [field.name for field in FIELDS]
 GOLDEN = Path(__file__).parents[2] / "golden"

@@ -18,16 +18,14 @@ from flexgs_edge.methods.best.costs import measure_costs
 from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.rounds import sum_row_bytes
 from flexgs_edge.render.ahead import camera_record
-from flexgs_edge.render.chunk_bounds import ChunkBounds
-from flexgs_edge.render.chunks import SourcePlanes
+from flexgs_edge.render.chunks import ChunkBounds, SourcePlanes
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.curve import near_rows
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import FORMS, large_budget, open_form
 from synthetic import NotedSource, joined, look_from, make_camera, random_scene
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from benchmarks.removal_exactness import compare_in_float64, kernels_without_ending, spread_over_range
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera, split_views
@@ -93,7 +94,7 @@ def exactness(backend: Backend, source: SceneSource, cameras: list[Camera], rows
     measured, rendered, noise = (np.zeros(len(rows)) for _ in range(3))
     with renderer.load(source) as scene:
         for camera in cameras:
-            sums = renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count)
+            sums = read_sums(renderer, renderer.removal_sums(scene, camera), 2, scene.count)
             measured += sums[0][rows] / FIXED_ERROR
             whole = renderer.render(scene, camera).astype(np.float64)
             for place, row in enumerate(rows):
@@ -255,7 +256,7 @@ def test_sums_go_beyond_64_bits() -> None:
     renderer, expected = Renderer(backend, large_budget()), [0, 0, 0]
     with renderer.load(source) as scene:
         for camera in cameras:
-            removal = renderer.read_sums(renderer.removal_sums(scene, camera), 2, scene.count)[0]
+            removal = read_sums(renderer, renderer.removal_sums(scene, camera), 2, scene.count)[0]
             expected = [old + more for old, more in zip(expected, removal.tolist(), strict=True)]
     assert max(expected) > 2**64
     assert costs.removal == pytest.approx(np.array(expected, np.float64) / FIXED_ERROR, rel=1e-12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +32,12 @@ from flexgs_edge.methods.best.refit.finetune import (
     finetune,
     structure_of,
 )
-from flexgs_edge.quality.ssim import ssims
+from flexgs_edge.quality.similarity import ssims
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 from tiny_project import make_project
@@ -46,7 +46,8 @@ Planes = dict[str, np.ndarray]
 KEPT = 150
 SEEN = 6
 STEPS = StepSizes(0.03, 0.25, 0.06, 0.5, 0.15, (0.12, 0.12))
-RATES = {"means": 5e-3, **FIELD_RATES}
+DEPTH = 50.0
+RATES = {"means": Schedule.means_rate * DEPTH, **FIELD_RATES}
 
 
 def view(seed: int, width: int = 45, height: int = 37) -> Camera:
@@ -85,11 +86,11 @@ class Workshop:
 
     def distil(self, steps: int, grid: StepSizes | None = None, **words: Any) -> Planes:
         structure = words.pop("structure", STRUCTURE)
-        return finetune(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, RATES, structure)
+        return finetune(self.kept, self.degrees, self.seen, Schedule(steps, **words), grid, structure)
 
     @property
     def seen(self) -> Original:
-        return Original(self.renderer, np.zeros(3), self.cameras, self.references)
+        return Original(self.renderer, np.zeros(3), self.cameras, self.references, depth=DEPTH)
 
     def rounded(self, planes: Planes) -> Planes:
         return from_grid(to_grid(planes, self.degrees, STEPS, np.zeros(3))[0])
@@ -112,6 +113,14 @@ def test_a_descent_gets_closer_than_a_refit_of_colours(workshop: Workshop) -> No
         workshop.fidelity, (workshop.kept, refitted, workshop.distil(12), workshop.distil(360))
     )
     assert long > refit + 2 > before + 4 and long > short > before, (before, refit, short, long)
+
+
+def test_positions_move_by_a_share_of_the_depth(workshop: Workshop) -> None:
+    moves = []
+    for depth in (0.5, 50.0):
+        planes = finetune(workshop.kept, workshop.degrees, replace(workshop.seen, depth=depth), Schedule(4))
+        moves.append(float(np.abs(planes["means"] - workshop.kept["means"]).max()))
+    assert 0 < 20 * moves[0] < moves[1], moves
 
 
 def test_structure_weighs_more_where_ssim_decides() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,9 +40,26 @@ def test_who_descends() -> None:
     assert finetune_steps(CompressOptions(), 4 * MANY_POSES, least) == round(2 * MANY_POSES * passes)
     assert finetune_steps(CompressOptions(), 100, least - 1) == 0 < finetune_steps(CompressOptions(), 100, least)
     assert finetune_steps(CompressOptions(distil=7), 100, least - 1) == 7
-    assert effort_of(CompressOptions()).interleaved > 0 == effort_of(CompressOptions(distil=7)).interleaved
+
     for words in ({"distil": 0}, {"refit": False}, {"effort": "fast"}):
         assert finetune_steps(CompressOptions(**words), 100, least) == 0, words
+
+
+@pytest.mark.parametrize(
+    ("automatic", "words", "descends"),
+    [
+        (False, {}, True),
+        (False, {"distil": 7}, False),
+        (True, {"max_drop": 1.0}, False),
+        (True, {"max_size": 10}, True),
+    ],
+)
+def test_who_descends_between_rounds(automatic: bool, words: dict[str, Any], descends: bool) -> None:
+    target = SimpleNamespace(limit_bytes=words.get("max_size"))
+    run: Any = SimpleNamespace(
+        options=CompressOptions(**words), seen=SimpleNamespace(automatic=automatic), target=target
+    )
+    assert (effort_of(run).interleaved > 0) == descends
 
 
 @pytest.mark.parametrize(

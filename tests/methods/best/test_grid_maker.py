@@ -106,22 +106,26 @@ def test_no_more_gaussians_than_allowed(target: Target) -> None:
     assert found.reached and all(step.count <= 100 for step in found.steps)
 
 
-def test_a_multiplier_that_asks_for_more_than_descents_left_chooses_from_before() -> None:
+def test_the_second_miss_with_all_that_a_descent_left_goes_back_to_the_descent_before() -> None:
     rounds = FakeRounds()
     selection = Mended(rounds, effort=replace(EFFORT, interleaved=1), steps=100).selection
-    counts = {}
     for size in (400, 200):
         some = np.sort(np.argsort(-rounds.snapshots[0].costs.removal, kind="stable")[:size])
         planes = {name: values[:, some] for name, values in rounds.snapshots[0].planes.items()}
         rounds.renew(partial(lambda rows, values: (rows, values), some, planes))
-    for power in range(24, -37, -1):  # towards more Gaussians, from those that the last descent left
-        selection.begin = 2
-        counts[power] = len(selection.kept(2.0**power * AT).rows), selection.begin
-    assert {begin for _, begin in counts.values()} == {2, 1, 0}
-    assert [begin for _, begin in counts.values()] == sorted((begin for _, begin in counts.values()), reverse=True)
-    for count, begin in counts.values():
-        assert {2: 0, 1: ALL_LEFT * 200, 0: ALL_LEFT * 400}[begin] <= count
-        assert begin == 0 or count < ALL_LEFT * {2: 200, 1: 400}[begin]
+    few, all_left = 2.0**24 * AT, 2.0**-36 * AT
+    for begin, count in ((2, 200), (1, 400)):
+        selection.begin = begin
+        kept = selection.kept(few)
+        assert len(kept.rows) < ALL_LEFT * count
+        selection.missed(kept)
+        assert selection.begin == begin
+        kept = selection.kept(all_left)
+        assert len(kept.rows) == count and selection.begin == begin
+        selection.missed(kept)
+        assert selection.begin == begin  # a finer grid may do
+        selection.missed(kept)
+        assert selection.begin == begin - 1
 
 
 @pytest.mark.parametrize("most", [1, 4])
@@ -155,11 +159,21 @@ def test_a_descent_that_makes_the_deciding_views_worse_is_undone(target: Target)
 def test_a_second_descent_that_is_undone_leaves_the_first() -> None:
     rounds = FakeRounds()
     made = Mended(rounds, effort=replace(EFFORT, interleaved=2), steps=100)
+    made.part = 0.2
     found = iter([30.0, 31.0, 30.0, 29.0])  # before and after each
     made._fidelity = lambda planes: next(found)  # type: ignore[method-assign]
     made.start(MaxDrop(1.0))
     marked = [bool((snapshot.planes["opacity_logits"] == MARK).all()) for snapshot in rounds.snapshots]
     assert made.steps == 100 and len(made.calls) == 2 and made.selection.begin == marked.index(True)
+
+
+def test_a_descent_that_leaves_more_than_allowed_is_undone() -> None:
+    rounds = FakeRounds()
+    made = Mended(rounds, effort=replace(EFFORT, interleaved=2), steps=100)
+    made.part = 0.9
+    made.start(MaxDrop(1.0))
+    assert len(made.calls) == 1 and made.selection.begin == 0 and made.steps == 100
+    assert made._after(0.0) == pytest.approx(np.log(0.9))  # what it mended is expected of others
 
 
 @pytest.mark.parametrize("ssim", [0.001, 0.03])

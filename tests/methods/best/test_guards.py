@@ -13,7 +13,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.commands.compress import compress
+from flexgs_edge.commands.compress import FIT_GAP, NEEDED_VIEWS, compress, view_warnings
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.goals.promise import Promised, WorstView
 from flexgs_edge.goals.steps import Choice, Scored
@@ -25,14 +25,12 @@ from flexgs_edge.quality.psnr import psnr
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.few_poses import MOST, STEP, FewPoses
-from flexgs_edge.run.open_scene import open_scene
+from flexgs_edge.run.few_poses import MOST, STEP, FewPoses, middle_of, usual_depth, visible_depths
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.view_set import ViewSet
-from flexgs_edge.run.warnings import FIT_GAP, NEEDED_VIEWS, view_warnings
-from flexgs_edge.views.depths import middle_of, visible_depths
 from kernel_fixtures import count, draw, large_budget, open_form
+from scene_files import open_scene
 from synthetic import make_camera, make_splats, random_scene
 from tiny_project import make_project
 
@@ -157,6 +155,7 @@ def test_depth_of_what_is_looked_at() -> None:
     away = make_camera(60, 45, translation=(0.0, 0.0, 2.0))
     blind = make_camera(60, 45, translation=(0.0, 0.0, -50.0))
     assert visible_depths(renderer, source, [camera, blind, away]) == pytest.approx([4.0, 5.0, 6.0])
+    assert usual_depth(renderer, source, [camera, blind, away]) == pytest.approx(5.0)
     assert visible_depths(renderer, source, [blind]) == [1.0]
     source.origin = np.array([10.0, 20.0, 30.0])
     (depth,) = visible_depths(renderer, source, [camera.moved(-source.origin)])

@@ -19,10 +19,8 @@ from flexgs_edge.methods.best.layers import SORTED_ROW_BYTES, worthiest
 from flexgs_edge.methods.best.refit.finetune import FIELD_RATES
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.growth import growth
-from flexgs_edge.scene.source import MemorySource, Planes
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.scene.source import MemorySource, Planes, growth
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 

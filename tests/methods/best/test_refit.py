@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.harness import read_sums
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import FIXED_ERROR, SH_C0
@@ -18,8 +19,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.fields import FIELD, sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import large_budget, open_form, same_bits
 from synthetic import look_from, make_camera, random_scene
 
@@ -130,7 +130,7 @@ def test_a_lone_splat_comes_back_by_the_same_share_each_round() -> None:
         statistics = Statistics.zeros(1)
         for camera in workshop.cameras:
             workshop.renderer.add_statistics(scene, camera, statistics)
-            sums = workshop.renderer.read_sums(workshop.renderer.removal_sums(scene, camera), 2, 1)
+            sums = read_sums(workshop.renderer, workshop.renderer.removal_sums(scene, camera), 2, 1)
             weight2 += sums[1, 0] / FIXED_ERROR
         weight = statistics.weight_sums[0]
     for before, after in zip(left, left[1:]):

@@ -15,8 +15,7 @@ from flexgs_edge.methods.best.costs import Snapshot
 from flexgs_edge.methods.best.rounds import SNAPSHOTS_HELD, PruneRounds, take_rows
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.views.original import Original
-from flexgs_edge.views.references import References
+from flexgs_edge.views.references import Original, References
 from kernel_fixtures import large_budget, open_form
 from synthetic import look_from, make_camera, random_scene
 

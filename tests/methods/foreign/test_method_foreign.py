@@ -21,8 +21,8 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.report.results import CompressResult
-from flexgs_edge.run.open_scene import open_scene
 from flexgs_edge.scene.fields import FIELD
+from scene_files import open_scene
 from stopped import Stopped
 from synthetic import random_scene
 from tiny_project import COUNT, make_project

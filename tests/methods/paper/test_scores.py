@@ -8,7 +8,7 @@ import pytest
 import reference_renderer
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.errors import InputError
-from flexgs_edge.methods.paper.scores import score_scene
+from flexgs_edge.methods.paper.method import score_scene
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
@@ -76,8 +76,3 @@ def test_cameras_that_see_nothing(form: str) -> None:
     away = make_camera(20, 20, rotation=np.diag([-1.0, 1.0, -1.0]))
     with pytest.raises(InputError, match=r"none of the 2 cameras sees any of the 50 Gaussians.*--near"):
         score(form, "gs", random_scene(50, 31), [away, away])
-
-
-def test_unknown_kind() -> None:
-    with pytest.raises(InputError, match="score 'size': expected one of gs, meson"):
-        score("numpy", "size", scene(), cameras())

@@ -1,8 +1,6 @@
-import { StreamSource } from './incoming.js';
 import { MAGIC } from './limits.js';
-import { openRanged } from './ranged.js';
+import { openSource } from './open.js';
 import { toSource } from './sources.js';
-import { openStreamed } from './streamed.js';
 
 export { FgsError } from './errors.js';
 export { FgsFile } from './file.js';
@@ -13,8 +11,7 @@ export { openPreview } from './preview.js';
  * Open a `.fgs` file of version 1 or 2: read and check its header and its model. See `index.d.ts`.
  */
 export async function open(given, options = {}) {
-  const source = await toSource(given, options.fetch);
-  return (source instanceof StreamSource ? openStreamed : openRanged)(source, options.name ?? '');
+  return openSource(await toSource(given, options.fetch), options.name ?? '');
 }
 
 /** Whether bytes begin like a `.fgs` file of any version. */

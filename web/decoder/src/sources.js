@@ -1,19 +1,7 @@
 // Where bytes come from. Ranged sources give any part of a file; streamed ones give all bytes once.
-import { bodyOf, prefetch, prefetched } from './http.js';
+import { bodyOf, prefetched } from './http.js';
 import { StreamSource } from './incoming.js';
-import { MemorySource } from './memory.js';
-
-/** A `Blob` or a `File`, which is read part by part. */
-export class BlobSource {
-  constructor(blob) {
-    this.blob = blob;
-    this.size = blob.size;
-  }
-
-  async read(offset, length) {
-    return new Uint8Array(await this.blob.slice(offset, offset + length).arrayBuffer());
-  }
-}
+import { webSource } from './web-sources.js';
 
 const inNode = typeof globalThis.process?.versions?.node === 'string';
 
@@ -23,18 +11,14 @@ const inNode = typeof globalThis.process?.versions?.node === 'string';
  * @returns {Promise<MemorySource | BlobSource | HttpSource | StreamSource | {size: number, read: Function}>}
  */
 export async function toSource(given, init = {}) {
-  if (given instanceof ArrayBuffer) return new MemorySource(new Uint8Array(given));
-  if (ArrayBuffer.isView(given)) {
-    return new MemorySource(new Uint8Array(given.buffer, given.byteOffset, given.byteLength));
-  }
-  if (typeof Blob !== 'undefined' && given instanceof Blob) return new BlobSource(given);
-  if (inNode) {
+  const isAddress = typeof given === 'string' || given instanceof URL;
+  if (inNode && (isAddress || typeof given?.pipe === 'function')) {
     const node = await import('#node');
-    const address = typeof given === 'string' || given instanceof URL;
-    if (address && node.isPath(given)) return node.PathSource.of(given);
-    if (typeof given?.pipe === 'function') return node.streamSource(given);
+    if (!isAddress) return node.streamSource(given);
+    if (node.isPath(given)) return node.PathSource.of(given);
   }
-  if (typeof given === 'string' || given instanceof URL) return prefetched(await prefetch(given, init), init);
+  const source = await webSource(given, init);
+  if (source) return source;
   if (typeof Response !== 'undefined' && given instanceof Response) return new StreamSource(bodyOf(given));
   if (typeof given?.getReader === 'function') return new StreamSource(given);
   if (typeof given?.read === 'function' && Number.isSafeInteger(given.size)) return given;

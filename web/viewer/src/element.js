@@ -1,6 +1,7 @@
 // <flexgs-scene src="scene.fgs">: a scene in any page. Attributes: src, view (of a link), turn (degrees a second), poster (a picture to
-// show until the scene is there), controls="none". Events: first, loaded, failed. `viewer` is its Viewer.
+// show until the scene is there), notes (address of their JSON), controls="none". Events: first, loaded, failed. `viewer` is its Viewer.
 import { viewOfWord } from './camera.js';
+import { notesOf, showNotes } from './notes.js';
 import { SceneViewer } from './scene-viewer.js';
 
 class SceneElement extends HTMLElement {
@@ -30,6 +31,8 @@ class SceneElement extends HTMLElement {
     const calm = matchMedia('(prefers-reduced-motion: reduce)').matches;
     this.viewer.turning = calm ? 0 : Number(this.getAttribute('turn')) || 0;
     this.#load();
+    const { viewer } = this;
+    notesOf(this.getAttribute('notes')).then((list) => showNotes(viewer, list)).catch((error) => this.#tell('failed', error.message));
   }
 
   disconnectedCallback() {

@@ -1,4 +1,6 @@
-import { open, openPreview } from '../../decoder/src/index.js';
+import { openSource } from '../../decoder/src/open.js';
+import { openPreview } from '../../decoder/src/preview.js';
+import { webSource } from '../../decoder/src/web-sources.js';
 import { headerOf, sendAll, sendChunk, sendError, sendPreview } from './load.js';
 
 /**
@@ -18,7 +20,7 @@ async function act(data) {
     return sendChunk(await file.chunk(data.get), file.shDegree, data.start, data.shStart, data.shEnd);
   }
   if (data.preview) return sendPreview(preview, file.shDegree, data.start, data.shStart);
-  file = await open(data.source, { name: data.name });
+  file = await openSource(await webSource(data.source), data.name);
   preview = await openPreview(file, data.name);
   const small = preview && headerOf(preview);
   return self.postMessage({ header: { ...headerOf(file), anyChunk: Boolean(file.chunk), preview: small } });

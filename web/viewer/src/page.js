@@ -2,6 +2,7 @@
 import { startOf, viewOfWord, viewWord } from './camera.js';
 import { isTyping } from './controls.js';
 import { bytesInside } from './inside.js';
+import { notesOf, showNotes } from './notes.js';
 import { SceneViewer } from './scene-viewer.js';
 
 const find = (id) => document.getElementById(id);
@@ -30,9 +31,17 @@ function start() {
   if (!matchMedia('(prefers-reduced-motion: reduce)').matches) viewer.turning = Number(asked.get('turn')) || 0;
   wire(viewer);
   wireFiles(viewer);
-  const begin = { poses: config.poses, look: config.look, start: viewOfWord(asked.get('view')) };
+  if (config.command) find('more').addEventListener('toggle', () => offerBox(viewer), { once: true });
+  const notes = config.notes ?? asked.get('notes');
+  const begin = { poses: config.poses, look: config.look, start: viewOfWord(asked.get('view')), notes };
   if (first) show(viewer, first.source, first.name, begin);
   else say('Drop a .fgs file here, or choose one in the panel.');
+}
+
+/** Few want it, and a page is shorter without. */
+async function offerBox(viewer) {
+  const { offerCrop } = await import(new URL('src/crop.js', document.baseURI));
+  offerCrop(viewer, find('more'), () => config.command);
 }
 
 /** The scene of the page: bytes that lie in it, or an address. */
@@ -45,15 +54,20 @@ function firstScene() {
   return { source: source.href, name: config.name ?? decodeURIComponent(source.pathname.split('/').pop()) };
 }
 
-async function show(viewer, source, name, begin = {}) {
+let takeNotesAway = () => {};
+let shows = 0;
+
+async function show(viewer, source, name, { notes, ...begin } = {}) {
   say('Loading …');
+  takeNotesAway();
+  const coming = notesOf(notes);
+  const turn = ++shows;
+  // Another scene may be shown when they are here.
+  coming.then((list) => turn === shows && (takeNotesAway = showNotes(viewer, list))).catch(() => {});
   document.title = name ? `${name} – flexgs-edge` : 'flexgs-edge';
   find('name').textContent = name ?? '';
-  await viewer.load(source, { name, ...begin, agree }).catch(() => {});
-}
-
-async function agree(bytes) {
-  return confirm(`The scene takes ${Math.round(bytes / 2 ** 20)} MB of graphics memory. Load it?`);
+  await viewer.load(source, { name, ...begin }).catch(() => {});
+  await coming.catch((error) => turn === shows && say(error.message, true));
 }
 
 function wire(viewer) {
@@ -89,7 +103,7 @@ function wire(viewer) {
   change('antialiased', (field) => (viewer.look.antialiased = field.checked));
   change('background', (field) => (viewer.look.background = fromHex(field.value)));
   change('fly', (field) => (viewer.controls.fly = field.checked));
-  change('share', (field) => viewer.setShare(Number(field.value) / 100));
+  change('share', (field) => viewer.asks = Number(field.value) / 100);
   change('scale', (field) => (viewer.scale = Number(field.value)));
   change('theme', (field) => (document.documentElement.dataset.theme = field.value));
   find('reset').addEventListener('click', () => viewer.setPose(viewer.pose ?? 0));
@@ -101,7 +115,7 @@ function wire(viewer) {
 
 /** What a device shows that has no room for all. */
 function roomNote({ rows, header, share }) {
-  return share < 1 ? `This device has room for ${rows} of ${header.count} splats: it shows those that cover most.` : '';
+  return share < 1 ? `There is room for ${rows} of ${header.count} splats: some are shown, and larger.` : '';
 }
 
 function shortcut(viewer, event) {
@@ -191,6 +205,7 @@ function showNumbers({ stats, canvas, renderer }) {
 function wireFiles(viewer) {
   const open = (file) => {
     config.name = file.name;
+    config.command?.splice(2, Infinity, file.name);
     show(viewer, file, file.name);
   };
   find('file').addEventListener('change', (event) => event.target.files[0] && open(event.target.files[0]));

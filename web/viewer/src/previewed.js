@@ -1,13 +1,15 @@
-/** A preview in a viewer. Its rows lie behind those of the scene, whose chunks wait until it is taken away. */
+/** A preview in a viewer. Its rows lie behind those that the scene has room for. The scene's chunks wait until it is taken away. */
 export class Previewed {
   /**
    * @param {Viewer} viewer
+   * @param {{count: number, shRows: number}} header of the scene
    * @param {{count: number, shRows: number}} room of the scene
-   * @param {{count: number, shRows: number}} preview its header
    */
-  constructor(viewer, room, { count, shRows }) {
+  constructor(viewer, header, room) {
+    const { count, shRows } = header.preview;
     this.viewer = viewer;
-    this.start = room.count;
+    this.start = header.count;
+    this.moves = [room.count - header.count, room.shRows - header.shRows];
     this.room = { ...room, count: room.count + count, shRows: room.shRows + shRows };
     this.parts = [];
     this.waiting = [];
@@ -22,9 +24,11 @@ export class Previewed {
 
   /** Take the preview away. Returns the chunks that have waited. */
   end() {
-    for (const { start, rows } of this.parts) {
-      this.viewer.sorter.postMessage({ add: { means: new Float32Array(), importance: new Float32Array(), start } });
+    for (const { start, rows, shRows } of this.parts) {
+      const add = { means: new Float32Array(), importance: new Float32Array(), start: start + this.moves[0] };
+      this.viewer.sorter.postMessage({ add });
       this.viewer.rows -= rows;
+      this.viewer.shRows -= shRows;
     }
     return this.waiting;
   }

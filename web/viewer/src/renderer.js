@@ -1,5 +1,9 @@
 import { shPerLine, shTexels, TEXELS, TEXTURE_WIDTH } from './pack.js';
 import { FINAL_FRAGMENT, FINAL_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from './shaders.js';
+import { ROW_BITS } from './some.js';
+
+const BESIDE_PREVIEW = 15 / 16;
+const EVERYWHERE = [-3e38, 3e38].map((end) => [end, end, end]);
 
 /** Draws splats with WebGL2. */
 export class Renderer {
@@ -31,10 +35,11 @@ export class Renderer {
     return header.count * TEXELS * 16 + header.shRows * shTexels(header.shDegree) * 16;
   }
 
-  /** How many rows, and rows with SH, textures have room for. */
+  /** How many rows, and rows with SH, textures have room for beside a preview. */
   most(degree) {
-    const lines = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE);
-    return { count: (lines * TEXTURE_WIDTH) / TEXELS, shRows: lines * shPerLine(degree) };
+    const lines = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE) * BESIDE_PREVIEW;
+    const count = Math.min((lines * TEXTURE_WIDTH) / TEXELS, 2 ** ROW_BITS * BESIDE_PREVIEW);
+    return { count, shRows: lines * shPerLine(degree) };
   }
 
   /** Make room for a scene. */
@@ -44,10 +49,6 @@ export class Renderer {
     this.degree = header.shDegree;
     const dataLines = Math.max(1, Math.ceil((header.count * TEXELS) / TEXTURE_WIDTH));
     const shLines = Math.max(1, Math.ceil(header.shRows / shPerLine(header.shDegree)));
-    const { count, shRows } = this.most(header.shDegree);
-    if (header.count > count || header.shRows > shRows) {
-      throw new Error(`The scene has ${header.count} splats; this device has room for ${count}.`);
-    }
     this.data = makeTexture(gl, gl.RGBA32UI, TEXTURE_WIDTH, dataLines);
     this.sh = makeTexture(gl, gl.RGBA32UI, TEXTURE_WIDTH, shLines);
     if (gl.getError() === gl.OUT_OF_MEMORY) throw new Error('The scene does not fit into this device’s memory.');
@@ -130,6 +131,7 @@ export class Renderer {
     gl.uniform1i(at('shPerLine'), shPerLine(this.degree));
     gl.uniform1i(at('antialiased'), look.antialiased ? 1 : 0);
     gl.uniform1f(at('growth'), growth);
+    for (const [i, name] of ['low', 'high'].entries()) gl.uniform3fv(at(name), look.crop?.[i] ?? EVERYWHERE[i]);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);

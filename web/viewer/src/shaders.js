@@ -1,34 +1,27 @@
 // The equations of docs/drawing.md.
 
 export const SPLAT_VERTEX = `#version 300 es
-precision highp float;
-precision highp int;
-precision highp usampler2D;
-layout(location = 0) in uint row;
-uniform usampler2D data;
-uniform usampler2D sh;
+layout(location = 0) in uint word;  // row, and steps below the level of sort.js
+uniform highp usampler2D data, sh;
 uniform mat3 toCamera;
 uniform vec3 eye;
-uniform vec2 focal;
-uniform vec2 middle;
-uniform vec2 size;
-uniform float near;
-uniform int degree;
-uniform int shTexels;
-uniform int shPerLine;
+uniform vec2 focal, middle, size;
+uniform float near, growth;
+uniform vec3 low, high;
+uniform int degree, shTexels, shPerLine;
 uniform bool antialiased;
-uniform float growth;
 flat out vec2 centre;
 flat out vec3 conic;
 flat out vec4 colour;
 
 const float DILATION = 0.3;
+const float GROWN = 0.00866434;  // a step's part of the logarithm, as growthOf in some.js
 const float SHARE_MIN = 1.0 / (255.0 * 255.0);
 
 int firstSh;
 
 uvec4 texel(int k) {
-  int at = int(row) * 4 + k;
+  int at = int(word & 0x7fffffu) * 4 + k;
   return texelFetch(data, ivec2(at & 2047, at >> 11), 0);
 }
 
@@ -71,14 +64,15 @@ vec3 shOf(vec3 d, int most) {
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside: not shown
   uvec4 t0 = texel(0), t1 = texel(1);
-  vec3 away = uintBitsToFloat(t0.xyz) - eye;
+  vec3 here = uintBitsToFloat(t0.xyz), away = here - eye;
   vec3 p = toCamera * away;
   float opacity = 1.0 / (1.0 + exp(-uintBitsToFloat(t1.w)));
-  if (!(p.z > near) || opacity < 1.0 / 255.0) return;
+  if (!(p.z > near) || opacity < 1.0 / 255.0 || here != clamp(here, low, high)) return;
 
   // The covariance's factor, then its projection: rows of J R M.
   vec4 q = normalize(uintBitsToFloat(texel(2)));
-  vec3 s = growth * exp(uintBitsToFloat(t1.xyz));
+  float grown = growth * exp(GROWN * float(word >> 23));
+  vec3 s = grown * exp(uintBitsToFloat(t1.xyz));
   float w = q.x, x = q.y, y = q.z, z = q.w;
   mat3 m = mat3(
     s.x * vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),

@@ -15,16 +15,18 @@ const WIDER = 1.2;
 export class Space {
   /**
    * @param {object} header of the worker
-   * @param {number} budget most rows to hold; one chunk is held at least
+   * @param {number} budget most rows to hold; beside a preview, one chunk is held at least
    */
   constructor(header, budget) {
     this.parts = partsOf(header);
     const [rows, shRows] = ['rows', 'shRows'].map((name) => Math.max(...this.parts.map((part) => part[name])));
     const fits = header.count <= budget;
-    const most = fits ? this.parts.length : Math.min(this.parts.length, Math.max(1, Math.floor(budget / rows)));
-    this.free = fits ? ownPlaces(this.parts) : equalPlaces(most, rows, shRows);
+    /** The share of each chunk's rows that there is room for. */
+    this.share = fits || header.preview ? 1 : budget / header.count;
+    const most = Math.min(this.parts.length, Math.max(1, Math.floor(budget / rows)));
+    this.free = fits || this.share < 1 ? ownPlaces(this.parts, this.share) : equalPlaces(most, rows, shRows);
     const end = this.free.at(-1);
-    this.room = { count: end.start + end.rows, shRows: end.shEnd, shDegree: header.shDegree };
+    this.room = { count: end.start + end.rows, shRows: end.shStart + end.shRows, shDegree: header.shDegree };
   }
 
   /** Whether a header tells where each chunk lies. */
@@ -121,10 +123,12 @@ function partsOf({ settings: { boxes }, layers, chunkRows, steps }) {
 }
 
 /** A place for each chunk, in the order of the file. */
-function ownPlaces(parts) {
+function ownPlaces(parts, share) {
   let [start, shStart] = [0, 0];
-  return parts.map(({ index, rows, shRows }) => {
-    const place = { index, start, rows, shStart, shEnd: shStart + shRows };
+  return parts.map((part) => {
+    const rows = Math.floor(share * part.rows);
+    const shRows = Math.min(rows, part.shRows);
+    const place = { index: part.index, start, rows, shStart, shRows, shEnd: shStart + part.shRows };
     start += rows;
     shStart += shRows;
     return place;
@@ -132,7 +136,7 @@ function ownPlaces(parts) {
 }
 
 function equalPlaces(count, rows, shRows) {
-  return Array.from({ length: count }, (_, i) => ({ start: i * rows, rows, shStart: i * shRows, shEnd: (i + 1) * shRows }));
+  return Array.from({ length: count }, (_, i) => ({ start: i * rows, rows, shStart: i * shRows, shRows, shEnd: (i + 1) * shRows }));
 }
 
 /** Normals of the planes around a view, which point inwards: the sides, and forward. */

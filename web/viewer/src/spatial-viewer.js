@@ -1,27 +1,25 @@
-import { shPerLine, TEXELS, TEXTURE_WIDTH } from './pack.js';
 import { SpacePreview } from './preview-space.js';
 import { PreviewViewer } from './preview-viewer.js';
-import { Renderer } from './renderer.js';
 import { Space } from './space.js';
-import { GROWTH_POWER, UNASKED_BYTES } from './viewer.js';
+import { GROWTH_POWER } from './viewer.js';
 
 /** Chunks that are asked for at once: one comes while another is decoded. */
 const AT_ONCE = 2;
 
-/** A viewer of all scenes. Of large ones, chunks in sight come first, and a budget bounds how many are held. */
+/**
+ * A viewer of all scenes. Of large ones, chunks in sight come first, and a budget bounds how many splats are held: beside a preview
+ * the chunks in sight, else of all chunks those splats that cover most.
+ */
 export class SpatialViewer extends PreviewViewer {
   constructor(canvas, options) {
     super(canvas, options);
     this.addEventListener('frame', () => this.#ask());
   }
 
-  /** Most splats to hold: as the page's address says, or as many as graphics memory is used for without asking. */
+  /** Most splats to hold: as the page's address says, or as many as there is graphics memory for. */
   #budget(degree) {
-    const { gl } = this.renderer;
-    const asked = Number(new URLSearchParams(location.search).get('splats'));
-    const each = Renderer.bytesOf({ count: 1, shRows: 1, shDegree: degree });
-    const perLine = Math.min(TEXTURE_WIDTH / TEXELS, degree ? shPerLine(degree) : Infinity);
-    return Math.min(asked > 0 ? asked : UNASKED_BYTES / each, gl.getParameter(gl.MAX_TEXTURE_SIZE) * perLine);
+    const { count, shRows } = this.renderer.most(degree);
+    return Math.min(this.roomFor({ count: 1, shRows: 1, shDegree: degree }), count, degree ? shRows : Infinity);
   }
 
   roomOf(header) {
@@ -33,11 +31,16 @@ export class SpatialViewer extends PreviewViewer {
       this.loader.postMessage({ all: true });
       return super.roomOf(header);
     }
-    const { room } = this.space;
+    const { room, share } = this.space;
+    this.share = share;
     if (!header.preview) return room;
     this.spacePreview = new SpacePreview(this, this.space, header.preview);
     this.loader.postMessage({ preview: true, start: room.count, shStart: room.shRows });
     return this.spacePreview.room;
+  }
+
+  thinned(whole) {
+    return this.space ? super.thinned(whole, this.share, whole.start, whole.shStart) : super.thinned(whole);
   }
 
   get growth() {
@@ -48,15 +51,15 @@ export class SpatialViewer extends PreviewViewer {
     return ((missing * (cutFrom ?? { count }).count) / count) ** GROWTH_POWER;
   }
 
-  async loaded(data, agree) {
+  async loaded(data) {
     const { chunk } = data;
-    if (chunk) await this.ready;
-    const own = chunk && chunk.start < this.space?.room.count;
+    // Behind the room of the scene lies the preview, but also the place of a chunk of which nothing is kept.
+    const own = chunk && this.space && !(this.spacePreview && chunk.start >= this.space.room.count);
     if (own) {
       this.asking--;
       this.space.arrived(chunk.index);
     } else if (chunk) this.spacePreview?.add(chunk);
-    const done = await super.loaded(data, agree);
+    const done = await super.loaded(data);
     if (!this.space) return done;
     if (data.header) this.placeBox(this.space.box);
     this.spacePreview?.update();

@@ -1,4 +1,5 @@
 import { NO_SH, TEXELS } from './pack.js';
+import { cutOf, growthOf, isTaken, CHANCES, levelOf } from './some.js';
 
 /** The share of a scene's rows that fits, of rows and of rows with SH: at most 1. */
 export function shareOf({ count, shRows }, most) {
@@ -6,34 +7,52 @@ export function shareOf({ count, shRows }, most) {
 }
 
 /**
- * Those rows of a packed chunk that show most, packed alike.
+ * Some rows of a packed chunk, packed alike, and larger.
  *
  * @param {number} share of its rows that stay
  * @param {{start: number, shStart: number}} at where they go
+ * @param {number} shEnd where rows with SH have to end: those beyond lose them
  * @param {number} shWords words of a row's SH
  */
-export function thinChunk({ data, sh, means, importance, rows, shStart, index }, share, at, shWords) {
-  const kept = strongest(importance, Math.floor(share * rows));
+export function thinChunk({ data, sh, means, importance, rows, shStart, index }, share, at, shEnd, shWords) {
+  const { kept, below } = chosen(importance, Math.floor(share * rows));
   const some = new Uint32Array(kept.length * TEXELS * 4);
+  const floats = new Float32Array(some.buffer);
   const someSh = new Uint32Array(Math.min(sh.length, kept.length * shWords));
   const places = new Float32Array(3 * kept.length);
+  const shown = new Float32Array(kept.length);
   let shRows = 0;
-  kept.forEach((row, to) => {
-    const from = row * TEXELS * 4;
-    some.set(data.subarray(from, from + TEXELS * 4), to * TEXELS * 4);
-    for (let axis = 0; axis < 3; axis++) places[axis * kept.length + to] = means[axis * rows + row];
+  kept.forEach((row, i) => {
+    const [from, to] = [row * TEXELS * 4, i * TEXELS * 4];
+    some.set(data.subarray(from, from + TEXELS * 4), to);
+    const growth = growthOf(below[row]);
+    for (let axis = 0; axis < 3; axis++) {
+      floats[to + 4 + axis] += growth;
+      places[axis * kept.length + i] = means[axis * rows + row];
+    }
+    shown[i] = importance[row] + 2 * growth;
     const own = data[from + 3];
     if (own === NO_SH) return;
+    if (at.shStart + shRows >= shEnd) {
+      some[to + 3] = NO_SH;
+      some[to + 15] = 0; // its degree
+      return;
+    }
     const first = (own - shStart) * shWords;
     someSh.set(sh.subarray(first, first + shWords), shRows * shWords);
-    some[to * TEXELS * 4 + 3] = at.shStart + shRows++;
+    some[to + 3] = at.shStart + shRows++;
   });
-  const shown = Float32Array.from(kept, (row) => importance[row]);
   return { index, ...at, rows: kept.length, data: some, sh: someSh.slice(0, shRows * shWords), shRows, means: places, importance: shown };
 }
 
-/** Places of the `count` largest values, ascending. */
-function strongest(values, count) {
-  const order = Uint32Array.from(values.keys()).sort((a, b) => values[b] - values[a] || a - b);
-  return order.slice(0, count).sort();
+/** At most so many rows, ascending, and of each row of all how far it is below the level from which on all are kept. */
+function chosen(importance, most) {
+  const levels = Int32Array.from(importance, (value) => Math.max(0, Math.min(CHANCES - 1, levelOf(value))));
+  const counts = new Uint32Array(CHANCES);
+  for (const level of levels) counts[level]++;
+  for (let cut = cutOf(counts, most); ; cut++) {
+    const below = levels.map((level) => cut - level);
+    const kept = [...below.keys()].filter((row) => isTaken(row, below[row]));
+    if (kept.length <= most) return { kept, below };
+  }
 }

@@ -6,15 +6,26 @@ import { shTexels } from './pack.js';
 import { shareOf, thinChunk } from './thin.js';
 import { startWorker } from './workers.js';
 
-/** Bytes of graphics memory that are taken without asking. */
-export const UNASKED_BYTES = 256 * 2 ** 20;
+/** Bytes of graphics memory to take on a device with a gigabyte of memory, and such gigabytes at most. */
+const ROOM_BYTES = 64 * 2 ** 20;
+const ROOM_MOST = 8;
+const ROOM_USUAL = 4;
 export const GROWTH_POWER = 1 / 8;
 /** Most pixels of a picture, on phones and elsewhere. */
 const PIXELS = { coarse: 2e6, fine: 9e6 };
 /** While the camera moves, frames that take longer than this many milliseconds have fewer pixels, down to this scale. */
 const SMOOTH_MS = 50;
 const LEAST_SCALE = 0.25;
+/**
+ * Pictures that take longer even so, or longer than this where the camera stands still, have fewer splats, down to so many. The
+ * first ones have so many, and faster ones so many times more.
+ */
+const PATIENT_MS = 1000;
+const LEAST_DRAWN = 50_000;
+const FIRST_DRAWN = 250_000;
+const FASTER = 4;
 const REST_MS = 200;
+const SIGHT = 1.2; // splats reach beyond their centres
 /** While chunks come, this share of the time goes into pictures, at most. */
 const DRAWING_SHARE = 0.2;
 
@@ -51,6 +62,7 @@ export class Viewer extends EventTarget {
     this.look = { near: 0.2, degree: 4, antialiased: false, background: [0, 0, 0] };
     this.scale = 1;
     this.movingScale = 1;
+    this.asks = 1; // share of the splats to draw
     this.poses = [];
     this.stats = {};
     this.#reset();
@@ -96,12 +108,12 @@ export class Viewer extends EventTarget {
     this.rows = 0;
     this.shRows = 0;
     this.share = 1;
+    this.pace = { moving: FIRST_DRAWN, still: FIRST_DRAWN };
     this.order = null;
     this.box = null;
     this.wanted = false;
     this.sorting = null;
     this.sortedFor = null;
-    this.ticket = 0;
     this.stats = { splats: 0, drawn: 0, bytes: 0, layers: 0, sortMs: 0, frameMs: 0, firstMs: 0, wholeMs: 0 };
   }
 
@@ -109,15 +121,14 @@ export class Viewer extends EventTarget {
    * Load a scene.
    *
    * @param {string | Uint8Array | Blob} source an absolute address, or bytes
-   * @param {{name: string, poses: object[], pose?: number, start?: object, look?: object,
-   *   agree?: (bytes: number) => Promise<boolean>}} options `pose`: index of the first one, in place of the view that the
-   *   scene starts from; `start`: that view, in place of the file's
+   * @param {{name: string, poses: object[], pose?: number, start?: object, look?: object}} options `pose`: index of the first one,
+   *   in place of the view that the scene starts from; `start`: that view, in place of the file's
    * @returns {Promise<void>} when all is there
    */
-  async load(source, { name, poses = [], pose, start, look = {}, agree = async () => true }) {
+  async load(source, { name, poses = [], pose, start, look = {} }) {
     this.loader?.terminate();
     this.sorter?.terminate();
-    this.last = [source, { name, poses, pose, start, look, agree }];
+    this.last = [source, { name, poses, pose, start, look }];
     this.#reset();
     this.poses = poses;
     this.pose = pose;
@@ -137,16 +148,15 @@ export class Viewer extends EventTarget {
         reject(error);
       };
       load.onerror = (event) => failed(new Error(event.message || 'The worker that decodes did not start.'));
-      load.onmessage = ({ data }) => this.loaded(data, agree).then((done) => done && resolve(), failed);
+      load.onmessage = ({ data }) => this.loaded(data).then((done) => done && resolve(), failed);
       if (!begun) load.postMessage({ source, name });
     });
   }
 
   /** Act on what the worker sends. Returns whether all is there. */
-  async loaded(data, agree) {
+  async loaded(data) {
     if (data.error) throw new Error(data.error);
-    if (data.header) return this.#begin(data.header, agree);
-    await this.ready;
+    if (data.header) return this.#begin(data.header);
     if (data.chunk) this.#add(data.chunk);
     if (data.done) {
       this.loader.terminate();
@@ -161,21 +171,25 @@ export class Viewer extends EventTarget {
     this.refresh();
   }
 
+  /** Most splats to hold of a scene like this: as the page's address says, or as the device has memory for. */
+  roomFor(header) {
+    const asked = Number(new URLSearchParams(location.search).get('splats'));
+    const bytes = ROOM_BYTES * Math.min(navigator.deviceMemory ?? ROOM_USUAL, ROOM_MOST);
+    return asked > 0 ? asked : (header.count * bytes) / Math.max(1, Renderer.bytesOf(header));
+  }
+
   /** How many rows get room, and how many of them have SH. */
   roomOf(header) {
-    this.share = shareOf(header, this.renderer.most(header.shDegree));
+    const { count: most, shRows: shMost } = this.renderer.most(header.shDegree);
+    this.share = shareOf(header, { count: Math.min(most, this.roomFor(header)), shRows: shMost });
     const [count, shRows] = [header.count, header.shRows].map((rows) => Math.floor(this.share * rows));
     return { ...header, count, shRows };
   }
 
-  async #begin(header, agree) {
+  #begin(header) {
     this.header = header;
-    const room = this.roomOf(header);
-    const bytes = Renderer.bytesOf(room);
-    // Chunks that come while the user decides wait for the answer.
-    this.ready = bytes > UNASKED_BYTES ? agree(bytes) : Promise.resolve(true);
-    if (!(await this.ready)) throw new Error('The scene was not loaded.');
-    this.renderer.begin(room);
+    this.room = this.roomOf(header);
+    this.renderer.begin(this.room);
     const { near, background, antialiased } = header.settings;
     if (typeof near === 'number') this.look.near = near;
     if (Array.isArray(background) && background.length === 3) this.look.background = background.map(Number);
@@ -197,8 +211,8 @@ export class Viewer extends EventTarget {
   }
 
   #add(whole) {
-    const at = { start: this.rows, shStart: this.shRows };
-    const chunk = this.share < 1 ? thinChunk(whole, this.share, at, 4 * shTexels(this.header.shDegree)) : whole;
+    const chunk = this.share < 1 ? this.thinned(whole) : whole;
+    if (!chunk.rows) return; // of a chunk of few rows, a small share is none
     this.shRows += chunk.shRows;
     this.renderer.add(chunk);
     this.rows += chunk.rows;
@@ -210,6 +224,11 @@ export class Viewer extends EventTarget {
     this.#sortIfNeeded();
     this.#refreshSoon();
     this.#tell('chunk');
+  }
+
+  /** The rows of a chunk that there is room for. */
+  thinned(whole, share = this.share, start = this.rows, shStart = this.shRows) {
+    return thinChunk(whole, share, { start, shStart }, this.room.shRows, 4 * shTexels(this.header.shDegree));
   }
 
   /** The scene lies in this box: so far away the camera turns around it. */
@@ -239,16 +258,15 @@ export class Viewer extends EventTarget {
     return Math.max(dot(subtract(middle, eye), pose.rotation[2]), 0.1 * across, 1e-3);
   }
 
-  setShare(share) {
-    this.sorter?.postMessage({ share });
-    this.sortedFor = null;
-    this.refresh();
+  /** Most splats to draw now. */
+  get most() {
+    const rows = this.asks * this.rows;
+    return this.taking ? rows : Math.min(rows, this.pace[this.resting ? 'moving' : 'still']);
   }
 
   /** Factor on all scales while layers are missing (docs/drawing.md): what is there fills the gaps. */
   get growth() {
     const { layers, cutFrom, count } = this.header;
-    if (this.share < 1 && layers.length === 1) return this.share ** -GROWTH_POWER;
     const layered = cutFrom || layers.length > 1;
     return layered && this.rows ? ((cutFrom ?? { count }).count / this.rows) ** GROWTH_POWER : 1;
   }
@@ -305,10 +323,14 @@ export class Viewer extends EventTarget {
   #drew() {
     this.drawing = false;
     this.stats.frameMs = performance.now() - this.lastDraw;
-    if (this.resting) {
-      const scale = this.movingScale * Math.sqrt(SMOOTH_MS / Math.max(this.stats.frameMs, 1));
-      this.movingScale = Math.min(1, Math.max(LEAST_SCALE, scale));
-    }
+    const [kind, wanted] = this.resting ? ['moving', SMOOTH_MS] : ['still', PATIENT_MS];
+    const faster = wanted / Math.max(this.stats.frameMs, 1);
+    if (this.resting) this.movingScale = Math.min(1, Math.max(LEAST_SCALE, this.movingScale * Math.sqrt(faster)));
+    const most = Math.max(LEAST_DRAWN, Math.min(faster, FASTER) * this.stats.drawn);
+    if (faster > 1 && most > this.pace[kind]) {
+      if (this.most < this.rows) this.refresh();
+      this.pace[kind] = most;
+    } else if (faster < 1 && (!this.resting || this.movingScale === LEAST_SCALE)) this.pace[kind] = Math.min(this.pace[kind], most);
     this.#tell('timed');
   }
 
@@ -325,13 +347,17 @@ export class Viewer extends EventTarget {
   }
 
   #sortIfNeeded() {
-    const key = [...this.camera.depth, this.look.near, this.rows].join();
+    const { camera, look, most } = this;
+    const some = most < this.rows;
+    const key = [...camera.depth, look.near, this.rows, some && [most, camera.eye]].join();
     if (this.sorting || this.sortedFor === key || !this.rows) return;
     this.sortedFor = key;
-    this.sorting = ++this.ticket;
+    this.sorting = true;
     const buffer = this.order;
     this.order = null;
-    const message = { view: this.camera.depth, near: this.look.near, buffer, ticket: this.ticket };
+    const { width, height, fx, fy, eye } = this.view;
+    const sight = { eye, wide: ((SIGHT * Math.hypot(width / fx, height / fy)) / 2) ** 2 };
+    const message = { view: camera.depth, near: look.near, most: some ? most : undefined, sight, buffer };
     this.sorter.postMessage(message, buffer ? [buffer] : []);
   }
 
@@ -369,7 +395,9 @@ export class Viewer extends EventTarget {
 
   /** A PNG of the view in this size. */
   async picture(width = this.canvas.width, height = this.canvas.height) {
+    this.taking = true;
     await this.settled();
+    this.taking = false;
     this.renderer.draw(this.camera.view(width, height), this.look, this.growth);
     const blob = await new Promise((resolve) => this.canvas.toBlob(resolve, 'image/png'));
     this.refresh();

@@ -3,6 +3,7 @@ import { test } from 'node:test';
 import { boxOf, Camera, outsidePose, startOf, startPose, upOf, viewOfWord, viewWord } from '../src/camera.js';
 import { toHalf } from '../src/half.js';
 import { NO_SH, packChunk, shPerLine, shTexels } from '../src/pack.js';
+import { growthOf, ROW_BITS } from '../src/some.js';
 import { Sorter } from '../src/sort.js';
 import { cross, dot } from '../src/vectors.js';
 
@@ -32,17 +33,41 @@ test('rows are sorted back to front, ties by the row, and hidden ones are left o
   assert.deepEqual([...out], [0, 4, 2, 1, 5, 3]);
 });
 
-test('a share of the splats is that of the most important, in several chunks', () => {
+/** A sorter of two chunks of 5000 rows at depth 1, of which the second half shows so much more. */
+function twoChunks(more) {
   const sorter = new Sorter();
-  for (const base of [0, 100]) {
-    const rows = 50;
-    const means = new Float32Array(3 * rows).fill(1);
-    sorter.add(means, Float32Array.from({ length: rows }, (_, i) => base + i));
+  for (const add of [0, more]) sorter.add(new Float32Array(15_000).fill(1), new Float32Array(5000).fill(add));
+  return sorter;
+}
+
+/** Rows, and steps below the level from which on all are drawn. */
+function some(sorter, most, sight) {
+  const out = new Uint32Array(10_000);
+  const words = [...out.subarray(0, sorter.sort([0, 0, 1, 0], 0.2, out, most, sight))];
+  return { rows: words.map((word) => word % 2 ** ROW_BITS), below: words.map((word) => word >>> ROW_BITS) };
+}
+
+test('of too many splats some are drawn, everywhere, and they grow', () => {
+  const { rows, below } = some(twoChunks(0), 2500);
+  assert.ok(Math.abs(rows.length - 2500) < 100, rows.length);
+  for (let at = 0; at < 10_000; at += 100) {
+    const near = rows.filter((row) => row >= at && row < at + 100).length;
+    assert.ok(near >= 22 && near <= 28, `${near} of 100`);
   }
-  sorter.setShare(0.25);
-  const out = new Uint32Array(100);
-  assert.equal(sorter.sort([0, 0, 1, 0], 0.2, out), 25);
-  assert.ok([...out.subarray(0, 25)].every((row) => row >= 75));
+  assert.deepEqual([...new Set(below)], [64]);
+  assert.ok(Math.abs(Math.exp(growthOf(64)) - 4 ** 0.4) < 1e-9, 'a quarter of them, larger');
+});
+
+test('splats that show more, are nearer or in sight have a larger chance, and all have one', () => {
+  const shares = (sorter, sight) => [0, 1].map((half) => some(sorter, 5000, sight).rows.filter((row) => row < 5000 === !half).length);
+  const [small, large] = shares(twoChunks(Math.log(16)));
+  assert.ok(Math.abs(large / small - 16 ** 0.375) < 0.1, large / small);
+  const moved = twoChunks(0);
+  moved.parts[1].means.fill(4, 10_000);
+  assert.ok(Math.abs(shares(moved)[0] / shares(moved)[1] - 16 ** 0.375) < 0.1, 'four times as far');
+  moved.parts[1].means.fill(1, 10_000).fill(9, 0, 5000);
+  const [seen, unseen] = shares(moved, { eye: [0, 0, 0], wide: 4 });
+  assert.ok(seen / unseen > 7 && unseen > 500, [seen, unseen]);
 });
 
 test('a chunk takes the place of one that began at the same row', () => {

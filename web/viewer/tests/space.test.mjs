@@ -61,8 +61,22 @@ test('each chunk has its place in the order of the file, and the room is that of
   assert.deepEqual([places[2].shStart, places[2].shEnd, places[3].shStart], [1, 3, 3]);
 });
 
-test('over the budget, chunks out of sight give way to better ones, and no others', () => {
+test('over the budget, all chunks lose the same share of their rows', () => {
   const space = new Space(header(), 45);
+  assert.equal(space.share, 45 / 157);
+  assert.deepEqual(space.room, { count: 15 * 2 + 2, shRows: 15, shDegree: 1 });
+  space.look(view(14));
+  assert.equal(order(space).length, 16);
+  assert.deepEqual(
+    space.parts.sort((a, b) => a.index - b.index).map(({ place }) => place.start),
+    [...Array(16).keys()].map((k) => 2 * k),
+  );
+  assert.equal(space.parts[2].place.shEnd - space.parts[2].place.shStart, 2);
+});
+
+test('over the budget and beside a preview, chunks out of sight give way to better ones, and no others', () => {
+  const space = new Space(header({ preview: {} }), 45);
+  assert.equal(space.share, 1);
   assert.deepEqual(space.room, { count: 40, shRows: 8, shDegree: 1 });
   space.look(view(-14));
   const first = order(space);
@@ -82,7 +96,7 @@ test('over the budget, chunks out of sight give way to better ones, and no other
 });
 
 test('a chunk that was asked for and is not here yet keeps its place', () => {
-  const space = new Space(header(), 20);
+  const space = new Space(header({ preview: {} }), 20);
   space.look(view(-14));
   assert.deepEqual(order(space), [0, 8]);
   space.look(view(14));

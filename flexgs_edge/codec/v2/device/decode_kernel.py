@@ -3,8 +3,6 @@
 Its specification is `decode.decode_chunk`, which gives the same codes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,8 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.v2.chunk_plan import check_end
-from flexgs_edge.codec.v2.device.launch import INFO, PLACES, PLANES, RECORD, Device, launch_coding, pack_group, padded
+from flexgs_edge.codec.v2.device.launch import (
+    INFO,
+    PLACES,
+    PLANES,
+    RECORD,
+    Device,
+    DeviceArrays,
+    launch_coding,
+    pack_group,
+    padded,
+)
+from flexgs_edge.codec.v2.header import check_end
 from flexgs_edge.codec.v2.model import SHARED, Model
 from flexgs_edge.codec.v2.octree import TooManyNodes
 from flexgs_edge.codec.v2.rans import StreamError, first_states, lane_count
@@ -44,7 +52,7 @@ class RowSteps:
         )
 
 
-class ChunkKernel:
+class ChunkKernel(DeviceArrays):
     """Decodes several chunks of a file at once, one work-item each.
 
     `device`: a backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take
@@ -53,11 +61,11 @@ class ChunkKernel:
     """
 
     def __init__(self, device: Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
-        self.device, self.model, self.rows, self.chunks = device, model, rows, chunks
+        super().__init__(device)
+        self.model, self.rows, self.chunks = model, rows, chunks
         self._stride = padded(rows)
         self._word_stride = -(-data_bytes // 2) + RANS_LANES
         self._out_planes = _out_planes(model.sh_degree)
-        self._arrays: dict[str, Any] = {}
         self._lock = Lock()
         with ExitStack() as stack:
             stack.callback(self.close)
@@ -76,17 +84,6 @@ class ChunkKernel:
         """Bytes that a chunk takes on the device, without its stream and its table of values."""
         work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
         return padded(rows) * (work + 4 * _out_planes(sh_degree))
-
-    def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
-        if name not in self._arrays:
-            self._arrays[name] = self.device.array(shape, dtype)
-        return self._arrays[name]
-
-    def close(self) -> None:
-        """Free the arrays on the device."""
-        for array in self._arrays.values():
-            array.release()
-        self._arrays.clear()
 
     def codes(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[ChunkCodes | ValueError]:
         """Decode chunks (rows and bytes of each): the codes of each one, or the error that `decode.decode_chunk` raises."""
@@ -108,17 +105,9 @@ class ChunkKernel:
             self.device.write(self._array("steps", packed.shape, np.float32), packed)
             table = self._array("table", (self.chunks, self.rows, columns), np.float32)
             self.device.launch(
-                "grid_rows",
-                (len(chunks),),
-                self._stride,
-                self._out_planes,
-                self.model.sh_degree,
-                columns,
-                self.rows,
-                *steps.low,
-                *(self._arrays[name] for name in ("counts", "steps", "out")),
-                table,
-            )
+                "grid_rows", (len(chunks),), self._stride, self._out_planes, self.model.sh_degree, columns, self.rows,
+                *steps.low, *(self._arrays[name] for name in ("counts", "steps", "out")), table,
+            )  # fmt: skip
             results: list[np.ndarray | ValueError] = []
             for i, (count, error) in enumerate(zip(counts.tolist(), errors, strict=True)):
                 values = np.empty((count, columns), np.float32)

@@ -1,14 +1,22 @@
 """Encode by OpenCL kernels: `code_chunks` counts as `ports.CountPort` does, `encode_chunks` codes as `rans.Encoder` does."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.v2.device.launch import INFO, PLACES, PLANES, RECORD, Device, launch_coding, pack_group, padded
+from flexgs_edge.codec.v2.device.launch import (
+    INFO,
+    PLACES,
+    PLANES,
+    RECORD,
+    Device,
+    DeviceArrays,
+    launch_coding,
+    pack_group,
+    padded,
+)
 from flexgs_edge.codec.v2.groups import Group
 from flexgs_edge.codec.v2.model import SHARED
 from flexgs_edge.codec.v2.ports import CountPort, Raw
@@ -28,7 +36,7 @@ def device_bytes(rows: int, sh_degree: int) -> int:
     return padded(rows) * (work + 10 * (len(base_kinds()) + 3 * sh_rest_count(sh_degree))) + (1 << 22)
 
 
-class CountKernel:
+class CountKernel(DeviceArrays):
     """Counts the symbols of several chunks at once, one work-item each; NumPy counts those of positions.
 
     `device`: a backend whose work-items run as threads of a processor. `groups`: the groups of the model. `sh_degree`:
@@ -36,7 +44,8 @@ class CountKernel:
     """
 
     def __init__(self, device: Device, groups: list[Group], sh_degree: int, rows: int, chunks: int) -> None:
-        self.device, self.groups, self.sh_degree = device, groups, sh_degree
+        super().__init__(device)
+        self.groups, self.sh_degree = groups, sh_degree
         self._stride = padded(rows)
         self._planes = len(base_kinds()) + 3 * sh_rest_count(sh_degree)
         sizes = [group.contexts * group.symbols for group in groups]
@@ -60,21 +69,13 @@ class CountKernel:
             "batches": ((self._batches, 3), "u4"),
         }
         self._sizes = {name: int(np.prod(shape)) for name, (shape, _) in shapes.items()}
-        self._arrays: dict[str, Any] = {}
         with ExitStack() as stack:
             stack.callback(self.close)
-            self._arrays["info"] = device.array((chunks, len(INFO)), np.int32)
-            self._arrays["records"] = device.array(records.shape, np.int32)
-            device.write(self._arrays["records"], records)
+            self._array("info", (chunks, len(INFO)), np.int32)
+            device.write(self._array("records", records.shape, np.int32), records)
             for name, (shape, kind) in shapes.items():
-                self._arrays[name] = device.array((chunks, *shape), np.dtype(kind))
+                self._array(name, (chunks, *shape), np.dtype(kind))
             stack.pop_all()
-
-    def close(self) -> None:
-        """Free the arrays on the device."""
-        for array in self._arrays.values():
-            array.release()
-        self._arrays.clear()
 
     def count(self, chunks: Sequence[ChunkCodes], ports: Sequence[CountPort]) -> list[bool]:
         """Count chunks, and add each to its port; False for a chunk with too many escapes, which is not added."""

@@ -1,7 +1,5 @@
 """Shared by the codec's kernels and their host code: the device protocol, and the layout of records and planes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -14,19 +12,9 @@ _SPARE = 96  # Elements of each plane beyond its rows: vectors may load and stor
 INFO = ("rows", "lanes", "words", "status", "found", "found high", "wanted", "at")
 # Places in the record of an alphabet; the kernel has the same.
 PLACES = {
-    "start": 0,
-    "shift": 2,
-    "symbols": 3,
-    "sizes": 4,
-    "mean cuts": 8,
-    "error cuts": 23,
-    "slots": 38,
-    "entries": 102,
-    "mean weights": 166,
-    "error weights": 183,
-    "tables": 200,
-    "counts": 202,
-}
+    "start": 0, "shift": 2, "symbols": 3, "sizes": 4, "mean cuts": 8, "error cuts": 23, "slots": 38, "entries": 102,
+    "mean weights": 166, "error weights": 183, "tables": 200, "counts": 202,
+}  # fmt: skip
 RECORD = 203  # Length of a record in i32
 PLANES = {"cells": (2, "u8"), "weights": (8, "u2"), "bytes": (4, "u1"), "ints": (4, "i4"), "floats": (44, "f4")}
 """Work planes of a chunk: number and type of each."""
@@ -51,6 +39,25 @@ class Device(Protocol):
         """Run a kernel with so many work-items."""
 
 
+class DeviceArrays:
+    """Arrays on a device, by name."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self._arrays: dict[str, Any] = {}
+
+    def _array(self, name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+        if name not in self._arrays:
+            self._arrays[name] = self.device.array(shape, dtype)
+        return self._arrays[name]
+
+    def close(self) -> None:
+        """Free the arrays on the device."""
+        for array in self._arrays.values():
+            array.release()
+        self._arrays.clear()
+
+
 def launch_coding(
     device: Device,
     chunks: int,
@@ -67,16 +74,8 @@ def launch_coding(
     numbers, arrays = decoding or ([0] * 3, [shared[0]] * 4)
     more_numbers, more_arrays = counting or ([0] * 4, [shared[0]] * 5)
     device.launch(
-        "code_chunks",
-        (chunks,),
-        int(counting is not None),
-        *shape,
-        *numbers,
-        *more_numbers,
-        *shared,
-        *arrays,
-        *more_arrays,
-    )
+        "code_chunks", (chunks,), int(counting is not None), *shape, *numbers, *more_numbers, *shared, *arrays, *more_arrays,
+    )  # fmt: skip
 
 
 def padded(rows: int) -> int:

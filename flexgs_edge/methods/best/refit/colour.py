@@ -19,7 +19,7 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import planes_of
 from flexgs_edge.scene.fields import sh_rest_count
 from flexgs_edge.scene.source import MemorySource
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 from flexgs_edge.views.sums import Maker, ViewSums
 
 ROUND_VIEWS = 96  # Least poses of a round: docs/results/tuning.md#round_views

@@ -5,19 +5,17 @@ It needs no photos and adds no Gaussians, so the result cannot look better than 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.refit.descent import bit_prices
 from flexgs_edge.methods.best.refit.streamed_descent import open_descent
 from flexgs_edge.scene.rotations import canonical_axes
-from flexgs_edge.views.original import Original
+from flexgs_edge.views.references import Original
 
 FIELD_RATES = {"log_scales": 4e-2, "quats": 4.8e-3, "opacity_logits": 8e-2, "sh_dc": 8e-3, "sh_rest": 1e-3}
 """Largest changes of the other values in a step: 1.6 (opacities) to 8 times (scales, SH) the reference program's. That program
@@ -45,9 +43,8 @@ class Schedule:
     holding: float = 0.75  # share before geometry is held there
     # Squared error over all scored poses that a bit on the grid is worth. 0 (default): bits cost nothing.
     multiplier: float = 0.0
-    # Largest change of a position in a step, as a share of the cameras' extent: 0.4 times the reference program's. With
-    # more, positions shake.
-    means_rate: float = 0.7e-4
+    # Largest change of a position in a step, as a share of `Original.depth`. With more, positions shake.
+    means_rate: float = 0.9e-4
     mean_views: float = 0.25  # values on their grids are averaged over this many steps for each view
     # Weight of bits in the loss. It is above 1, since most Gaussians are not shown in all poses, and steps move only
     # those that are shown: docs/results/tuning.md#bit_weight
@@ -80,19 +77,7 @@ class Schedule:
 
 def structure_of(ssim_margin: float) -> float:
     """Weight of 1 - SSIM in the loss where SSIM is nearer to its bound than the mean by `ssim_margin`, 0 or more."""
-    return STRUCTURE + (MARGIN_STRUCTURE - STRUCTURE) * share_of_margin(ssim_margin)
-
-
-def share_of_margin(ssim_margin: float) -> float:
-    """0 where the mean decides, up to 1 where SSIM leads by `FULL_MARGIN` or more."""
-    return min(ssim_margin / FULL_MARGIN, 1.0)
-
-
-def rates_for(cameras: Sequence[Camera], means_rate: float) -> dict[str, float]:
-    """Rates of all fields. That of positions scales with the cameras' extent, 1.1 times the largest distance from their mean."""
-    centres = np.stack([camera.center for camera in cameras])
-    extent = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    return {"means": means_rate * extent, **FIELD_RATES}
+    return STRUCTURE + (MARGIN_STRUCTURE - STRUCTURE) * min(ssim_margin / FULL_MARGIN, 1.0)
 
 
 def finetune(
@@ -101,7 +86,6 @@ def finetune(
     original: Original,
     schedule: Schedule,  # number of steps, and when the grid comes in
     step_sizes: StepSizes | None = None,
-    rates: dict[str, float] | None = None,  # rates by field, in place of those of `rates_for`
     structure: float = STRUCTURE,  # weight of 1 - SSIM in the loss, beside the squared error
 ) -> dict[str, np.ndarray]:
     """Move all values of a scene towards the original's renders.
@@ -112,7 +96,7 @@ def finetune(
     the scene, its gradients and their running means do not fit into memory, and the renderer's storage has no files.
     """
     cameras = original.poses
-    rates = {**rates_for(cameras, schedule.means_rate), **(rates or {})}
+    rates = {"means": schedule.means_rate * original.depth, **FIELD_RATES}
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
     renderer, storage = original.renderer, original.renderer.storage
     # Rows with SH come first, so that the other chunks are drawn without SH.

@@ -29,8 +29,7 @@ from flexgs_edge.methods.best.refit.descent import (
     step_record,
     widths,
 )
-from flexgs_edge.render.chunk_bounds import ChunkBounds
-from flexgs_edge.render.chunks import ChunkArrays
+from flexgs_edge.render.chunks import ChunkArrays, ChunkBounds
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, RAW_BYTES, Fit, padded, plane_bytes, sum_bytes
 from flexgs_edge.render.renderer import Renderer
