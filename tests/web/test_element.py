@@ -132,16 +132,14 @@ def test_a_phone_draws_two_megapixels(tab: Browser, folder: Path) -> None:
             until(tab, "globalThis.viewer?.stats.wholeMs > 0 && !viewer.resting")
             width, height = tab.run("[viewer.view.width, viewer.view.height]")
             assert 1.9e6 < width * height <= 2e6 and height / width == pytest.approx(844 / 390, rel=0.01)
-            # The time that the page shows is that of the device, not of its commands.
+            # The time that the page shows is that of the device, not of its commands. Another process slows single frames.
             shown, read = tab.run(
-                "(async () => { const { gl } = viewer.renderer; const pixel = new Uint8Array(4); const times = [];"
-                "for (let i = 0; i < 3; i++) { const start = performance.now();"
-                "viewer.renderer.draw(viewer.view, viewer.look, viewer.growth);"
-                "gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); times.push(performance.now() - start); }"
-                "const shown = []; for (let i = 0; i < 3; i++) { viewer.refresh();"
-                "await new Promise((done) => viewer.addEventListener('timed', done, { once: true }));"
-                "shown.push(viewer.stats.frameMs); }"
-                "return [Math.min(...shown), Math.min(...times)]; })()"
+                "(async () => { const { gl } = viewer.renderer; const pixel = new Uint8Array(4); let read = 1e9, shown = 1e9;"
+                "for (let i = 0; i < 40 && (i < 3 || Math.abs(shown - read) > 0.1 * read); i++) {"
+                "const start = performance.now(); viewer.renderer.draw(viewer.view, viewer.look, viewer.growth);"
+                "gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); read = Math.min(read, performance.now() - start);"
+                "viewer.refresh(); await new Promise((done) => viewer.addEventListener('timed', done, { once: true }));"
+                "shown = Math.min(shown, viewer.stats.frameMs); } return [shown, read]; })()"
             )
             assert shown == pytest.approx(read, rel=0.2, abs=8)
             tab.run("document.querySelector('summary').click()")
