@@ -61,7 +61,8 @@ def evaluate(
         with clock.stage("load"):
             spare = drawing_bytes(run) + decode_bytes(scene.source, None)
             original_source = read_often(run.source, budget, spare, renderer.backend)
-        judge = QualityEvaluator(renderer, original_source, views, indices, base_psnr=base_psnr)
+        finetuned = _finetuned(scene.settings)
+        judge = QualityEvaluator(renderer, original_source, views, indices, base_psnr=base_psnr, finetuned=finetuned)
         stack.callback(judge.close)
         with clock.stage("references"), renderer.load(original_source) as original:
             judge.prepare(original, progress)
@@ -84,3 +85,11 @@ def evaluate(
         reporter.read_contents(input)
         reporter.write(result)
     return result
+
+
+def _finetuned(settings: dict[str, Any]) -> bool:
+    """Whether the scene with these settings was fine-tuned, as far as they say."""
+    distil = settings.get("distil")
+    return settings.get("method", "best") == "best" and (
+        settings.get("effort") != "fast" if distil is None else distil != 0
+    )

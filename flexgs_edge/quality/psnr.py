@@ -31,9 +31,9 @@ LEAST_GAIN = 0.5
 MOVED = 0.0015
 """By this angle pictures are moved to tell how far photos may be from them, radians: three quarters of a pixel of an automatic
 view."""
-LONE_BASES = 34.5, 36.0
-"""Least and largest base without photos, dB. Moved pictures of real cameras begin at 32.4, but what is fine-tuned to automatic
-views loses more from elsewhere."""
+LONE_BASES = 32.5, 34.5, 36.0
+"""Least base without photos, least base of what is fine-tuned, and largest base, dB. Moved pictures of real cameras begin at
+32.4. What is fine-tuned to automatic views loses more from elsewhere than it does there."""
 
 
 def mse(image: np.ndarray, reference: np.ndarray) -> float:
@@ -122,21 +122,22 @@ def moved_error(image: np.ndarray, focal: float) -> float:
     return error * min(MOVED * focal / step, 1.0) ** 2
 
 
-def lone_base(errors: Sequence[float], coverages: Sequence[float]) -> float:
+def lone_base(errors: Sequence[float], coverages: Sequence[float], finetuned: bool) -> float:
     """Assumed PSNR of an original against photos that are not there, dB.
 
     Pictures with much detail are farther from their photos than those with little, about as far as from themselves when they
     are moved by three quarters of a pixel: docs/results/tuning.md#default_base_psnr
 
     `errors`: `moved_error` of the original's render in each view. `coverages`: share of each view that the original
-    covers, which alone counts.
+    covers, which alone counts. `finetuned`: what is compared may have been fine-tuned to the views.
 
-    >>> lone_base([3.2e-4, 1.6e-4], [1.0, 0.5]), lone_base([0.0], [1.0])
-    (34.9, 36.0)
+    >>> lone_base([3.2e-4, 1.6e-4], [1.0, 0.5], True), lone_base([1.0], [1.0], True), lone_base([1.0], [1.0], False)
+    (34.9, 34.5, 32.5)
     """
     error = math.fsum(errors) / (math.fsum(coverages) or 1.0)
-    low, high = LONE_BASES
-    return round(min(max(-10.0 * math.log10(max(error, MSE_FLOOR)), low), high), 1)
+    low, finetuned_low, high = LONE_BASES
+    found = -10.0 * math.log10(max(error, MSE_FLOOR))
+    return round(min(max(found, finetuned_low if finetuned else low), high), 1)
 
 
 def contrast(image: np.ndarray) -> float:

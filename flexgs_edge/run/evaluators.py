@@ -35,8 +35,8 @@ class Evaluators(AbstractContextManager["Evaluators"]):
 
     def _judge(self, indices: list[int], reports: bool) -> QualityEvaluator:
         run = self._run
-        words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "reports": reports}
-        return QualityEvaluator(self._renderer, run.source, run.seen, indices, **words)
+        words = {"with_photos": reports, "base_psnr": run.options.base_psnr, "finetuned": run.options.finetunes}
+        return QualityEvaluator(self._renderer, run.source, run.seen, indices, reports=reports, **words)
 
     @property
     def storage(self) -> Storage:

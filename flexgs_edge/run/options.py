@@ -267,6 +267,13 @@ class CompressOptions(ViewOptions):
         return not self.targets and self.max_worst_drop in (None, NONE) and self.max_ssim_drop in (None, NONE)
 
     @property
+    def finetunes(self) -> bool:
+        """Whether results are fine-tuned to the views, unless they are too small or too large for it."""
+        return (
+            self.method == "best" and self.refit and (self.effort != "fast" if self.distil is None else self.distil > 0)
+        )
+
+    @property
     def takes_closest(self) -> bool:
         """Whether the closest result is written if none holds: who named no target wants a file all the same."""
         return self.best_effort or self.target_is_default

@@ -59,6 +59,7 @@ class QualityEvaluator:
         # Default: without photos what the original's renders tell (`lone_base`), else `DEFAULT_BASE_PSNR`, dB.
         base_psnr: float | None = None,
         reports: bool = False,
+        finetuned: bool = True,  # as for `lone_base`
     ) -> None:
         self.renderer = renderer
         budget = renderer.budget
@@ -69,7 +70,7 @@ class QualityEvaluator:
         self.covered_decides = views.photos is None
         self._automatic = views.automatic
         self.base_psnr = DEFAULT_BASE_PSNR if base_psnr is None else base_psnr
-        self._given_base = base_psnr
+        self._given_base, self._finetuned = base_psnr, finetuned
         self.reports = reports
         self.indices = list(indices)
         self._budget = budget
@@ -118,7 +119,7 @@ class QualityEvaluator:
                 self._original_error.append(mse(image, photo))
                 self._keep(("photo", i), photo)
         if self.photos is None and self._given_base is None:
-            self.base_psnr = lone_base(moved, self._coverage)
+            self.base_psnr = lone_base(moved, self._coverage, self._finetuned)
         self._far_bases = far_bases(self._original_error, contrasts, self.base_psnr)
         if not any(self._coverage):
             raise self._nothing_seen()

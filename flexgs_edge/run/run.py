@@ -48,6 +48,8 @@ from flexgs_edge.small_matrices import product
 
 EVERYTHING = Choice(0, 0)
 BEHIND_SHARE = 0.5  # We warn when more than this share of the Gaussians lies behind all cameras
+LARGE = 2_000_000
+"""Scenes of more Gaussians gain nothing by fine-tuning to automatic views: docs/results/tuning.md#large"""
 _SAMPLE_ROWS = 2048
 _SAMPLE_VIEWS = 64
 
@@ -259,7 +261,21 @@ def open_compression(
     with run.clock.stage("open"):
         if options.background is None and run.views is not None and run.views.photos is None:
             run = _standing_out(run, run.views)
-        return _positioned(run)
+        return _positioned(_affordable(run))
+
+
+def _affordable(run: Run[CompressOptions]) -> Run[CompressOptions]:
+    """The same run, with less work where a large scene gains nothing by more."""
+    options, views, count = run.options, run.views, run.source.count
+    asked = options.finetunes and options.distil is None and views is not None and views.automatic
+    if not asked or count <= LARGE:
+        return run
+    note = (
+        f"{count} Gaussians need so many automatic views that --effort {options.effort} would take long and gain nothing "
+        "over fast: this run works as --effort fast. With the scene's cameras (--cameras PATH) it fine-tunes."
+    )
+    LOG.warning("warning: %s", note)
+    return replace(run, options=replace(options, effort="fast"), warnings=(*run.warnings, note))
 
 
 def _standing_out(run: Run[CompressOptions], views: ViewSet) -> Run[CompressOptions]:

@@ -14,8 +14,8 @@ from flexgs_edge.constants import DEFAULT_NEAR
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.quality.psnr import LONE_BASES, MOVED, lone_base, moved_error
-from flexgs_edge.run.options import ViewOptions
-from flexgs_edge.run.run import open_run
+from flexgs_edge.run.options import CompressOptions, ViewOptions
+from flexgs_edge.run.run import open_compression, open_run
 from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.source import MemorySource
 from synthetic import make_camera, make_splats
@@ -52,6 +52,18 @@ def test_up_turns_automatic_views(lone: Path) -> None:
     assert "up is +x (--up)" in run.seen.notes[0]
     assert all(abs(camera.rotation[0, 0]) < 1e-12 for camera in run.seen.cameras)
     assert "up is -y (convention)" in open_run(lone, ViewOptions()).seen.notes[0]
+
+
+def test_a_large_scene_is_not_fine_tuned_to_automatic_views(lone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flexgs_edge.run.run.LARGE", 100)
+    run = open_compression(lone, None, CompressOptions(dry_run=True))
+    assert run.options.effort == "fast" and not run.options.finetunes and "works as --effort fast" in run.warnings[-1]
+    for options, given in (
+        (CompressOptions(dry_run=True, distil=9), None),
+        (CompressOptions(dry_run=True, holdout=0, select="train"), GivenViews([make_camera()])),
+    ):
+        run = open_compression(lone, None, options, given=given)
+        assert run.options.effort == "balanced" and run.options.finetunes and not run.warnings
 
 
 @pytest.mark.parametrize("kind", [DeviceError, BudgetError])
@@ -91,7 +103,9 @@ def test_the_base_follows_from_the_detail_of_the_pictures() -> None:
     # A ramp that is moved by a pixel changes by 1 / 79, in one of the two directions.
     assert moved_error(ramp, 1 / MOVED) == pytest.approx(0.5 / 79**2, rel=1e-3)
     assert moved_error(ramp, 0.5 / MOVED) == pytest.approx(0.125 / 79**2, rel=1e-3)
-    assert lone_base([0.0], [1.0]) == LONE_BASES[1] and lone_base([1.0], [1.0]) == LONE_BASES[0]
+    least, finetuned, largest = LONE_BASES
+    assert lone_base([0.0], [1.0], True) == lone_base([0.0], [1.0], False) == largest
+    assert lone_base([1.0], [1.0], True) == finetuned and lone_base([1.0], [1.0], False) == least
 
 
 @pytest.mark.parametrize(
