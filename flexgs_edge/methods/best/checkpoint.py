@@ -25,7 +25,6 @@ from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
 
 DONE = "done"  # File that is written last, with the checksums of all others. A round without it was cut short.
-READ_BYTES = 1 << 20
 
 
 class Checkpoint:
@@ -114,7 +113,7 @@ def _checksum(path: Path) -> int:
     """CRC-32 of a file."""
     found = 0
     with open(path, "rb") as file:
-        while block := file.read(READ_BYTES):
+        while block := file.read(1 << 20):
             found = zlib.crc32(block, found)
     return found
 

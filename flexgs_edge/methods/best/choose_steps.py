@@ -28,9 +28,6 @@ GEOMETRY = {
     "position": ("means", 3), "scale": ("log_scales", 3), "rotation": ("quats", 3), "opacity": ("opacity_logits", 1),
 }  # fmt: skip
 """Kinds of values: the field of each, and its coded values for a Gaussian."""
-SMALLEST_THREE = 1.051
-"""Mean square error of a rotation over that of its three stored components. The fourth component follows from these, so
-its error adds up: the mean of 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form."""
 CHROMA = 2.0
 """Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
 So equal slopes ask for sqrt(6) and 2."""
@@ -97,7 +94,9 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
         if kind == "scale":
             return (planes["log_scales"] + errors).astype(np.float32)
         if kind == "rotation":
-            return tilted(planes["quats"], errors * math.sqrt(SMALLEST_THREE)).astype(np.float32)
+            # Mean square error of a rotation over that of its three stored components. The fourth component follows from these,
+            # so its error adds up: the mean of 1 + |xyz|^2 / (3 w^2) over random rotations in their canonical form.
+            return tilted(planes["quats"], errors * math.sqrt(1.051)).astype(np.float32)
         moved: np.ndarray = (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
         return moved
     return (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)

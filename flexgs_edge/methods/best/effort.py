@@ -28,9 +28,6 @@ LARGEST_STEP = 4
 """Largest distance in pixels between the points that we look at. Splats of one or two pixels must not fall between them
 in every view: docs/results/tuning.md#distances"""
 STEP_UNIT = 1 / 32  # Distances are multiples of it, so that no last bit of a sum decides
-SHIFTS = 0.7548776662466927, 0.5698402909980532
-"""Shares of a distance by which the lattice moves right and down from view to view: powers of the root of x^3 = x + 1, whose
-multiples fill the unit square evenly."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +51,9 @@ class Effort:
     # The fewer pixels we fit, the less of the gain holds elsewhere. A value that is too low
     # makes the first candidate miss, and each further one costs a refit: docs/results/tuning.md#refitted
     refitted: float
+    # The same after the first descent; later ones end half way, as logs, between the loss before them and what the one before
+    # left: docs/results/tuning.md#distilled
+    finetuned: float = 0.36
     probed: int = 8  # most poses that trial grids are measured on: docs/results/tuning.md#probed
     # How often the descent to a candidate looks at every scored pose, if there are no more than `MANY_POSES`. 0
     # (default): colours are refitted instead.
@@ -110,9 +110,12 @@ def sampled_poses(cameras: Sequence[Camera], steps: Sequence[float]) -> list[Cam
     Lattices begin at other places in each view, by the order of the views' names. Names do not depend on the order of the
     poses, where a moved scene may break ties in another way.
     """
+    # Shares of a distance by which the lattice moves right and down from view to view: powers of the root of x^3 = x + 1,
+    # whose multiples fill the unit square evenly.
+    shifts = 0.7548776662466927, 0.5698402909980532
     places = np.argsort(np.argsort([camera.name for camera in cameras], kind="stable"), kind="stable")
     return [
-        camera.every(step, *(step * (place * shift % 1.0) for shift in SHIFTS)) if step > 1 else camera
+        camera.every(step, *(step * (place * shift % 1.0) for shift in shifts)) if step > 1 else camera
         for place, camera, step in zip(places.tolist(), cameras, steps, strict=True)
     ]
 

@@ -18,18 +18,14 @@ from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
 from flexgs_edge.run.options import CompressOptions
 
-LAYERS_COST = 1.06
-"""Most bytes of a layered file over those of a file without layers: neighbours on the curve are farther apart in it.
-docs/results/tuning.md#layers_cost"""
-SETTINGS_MOST = 1536  # Most bytes of the settings of any file in its header
-
 
 def projected_size(options: CompressOptions, size: int) -> int:
     """Bytes that a file of `size` bytes will have with the layers and the preview that were asked for.
 
-    A preview by default comes only where it fits.
+    A preview by default comes only where it fits. Layers cost at most 6 %, since neighbours on the curve are farther apart in a
+    layered file: docs/results/tuning.md#layers_cost
     """
-    cost = 1.0 if options.layers in (None, 1) else LAYERS_COST
+    cost = 1.0 if options.layers in (None, 1) else 1.06
     return round(cost * size) + with_preview(options.preview or 0)
 
 
@@ -45,7 +41,7 @@ class GridCoder:
     them before they are known.
     """
 
-    def __init__(self, renderer: Renderer, settings_room: int = SETTINGS_MOST) -> None:
+    def __init__(self, renderer: Renderer, settings_room: int) -> None:
         self._renderer, self._settings_room = renderer, settings_room
         self._last: tuple[GridScene, Encoded] | None = None
 

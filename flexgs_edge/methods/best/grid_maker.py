@@ -30,45 +30,27 @@ from flexgs_edge.methods.best.selection import Guess, Kept, Measure, Selection
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 
-DISTILLED = 0.36
-"""Expected loss after the first descent, divided by the loss before it: docs/results/tuning.md#distilled. Later ones end half
-way, as logs, between the loss before them and the one that the descent before left."""
-FULL_PASSES = 10
-"""Longest descent at full rates, in steps for each scored pose. Rates fall with the root of a longer one:
-docs/results/tuning.md#full_passes"""
-FULL_RATES, LEAST_RATE = 41.0, 0.25
-"""Fidelity in dB up to which a descent goes at full rates, and the least share of these rates: see `rate_from`."""
-PROBED_FROM = -1.2
-"""Rounds of pruning make the grid of their cut once the last snapshot is this near to a miss, as the log of the share."""
-MOST_FIT, LEAST_FIT, FIT_DESCENTS = 1.6, 0.8, 7
-"""With a target for the size, pruning stops for the first descent at so many times the Gaussians that fit, for the last one at so
-many; and most descents: docs/results/tuning.md#interleaved"""
-INTERLEAVED_SHARE, INTERLEAVED_LAST = 0.5, 0.2
-"""Steps of a descent between rounds, as a share of those of the descent to a candidate, and its last rates over its first:
-docs/results/tuning.md#interleaved"""
 FINE = 2.0**-8
 """Steps as shares of others, where they shall round nothing: of colours before their refit; and of the multiplier that chooses
 steps, where the format alone rounds."""
-AGAIN_STEPS, AGAIN_RATE = 0.5, 0.25
-"""Steps and rates of the descent behind colours that were clipped, as shares of those before it:
-docs/results/tuning.md#clipped"""
-PRICED, ABOVE = -0.035, 0.02
-"""Expected log of the size after a descent over that before it, below 0 since bits cost; and how far above a size we aim, since
-results that are too large can be trimmed: docs/results/tuning.md#landing"""
 
 
-def fits(most: int) -> list[float]:
-    """At how many times the Gaussians that a size allows pruning stops for each of at most so many descents."""
-    count = min(most, FIT_DESCENTS)
-    return [MOST_FIT * (LEAST_FIT / MOST_FIT) ** (k / max(count - 1, 1)) for k in range(count)]
+def fits(count: int, first: float = 1.6, last: float = 0.8) -> list[float]:
+    """At how many times the Gaussians that a size allows pruning stops for each of so many descents.
+
+    It stops for the `first` one with more than fit, and for the `last` one with fewer: docs/results/tuning.md#interleaved
+    """
+    return [first * (last / first) ** (k / max(count - 1, 1)) for k in range(count)]
 
 
-def rate_from(fidelity: float) -> float:
+def rate_from(fidelity: float, full: float = 41.0, least: float = 0.25) -> float:
     """Share of the full rates for a descent that starts at `fidelity` dB; it follows the root of the mean squared error.
 
     With little error left, full steps would break more than they repair: docs/results/tuning.md#rate_from
+
+    `full`: fidelity up to which rates are full, dB. `least`: the least share.
     """
-    return max(min(1.0, 10 ** ((FULL_RATES - fidelity) / 20)), LEAST_RATE)
+    return max(min(1.0, 10 ** ((full - fidelity) / 20)), least)
 
 
 Choose = Callable[[RemovalCosts, BitModel, float], tuple[np.ndarray, np.ndarray]]
@@ -107,7 +89,9 @@ class GridMaker:
         self._interleaved = effort.interleaved if steps else 0
         self._slopes: Slopes | None = None
         self._guess = Guess(measure)
-        self._mends = math.log(DISTILLED)  # by how much a first descent changes the excess; measured, if one is undone
+        self._mends = math.log(
+            effort.finetuned
+        )  # by how much a first descent changes the excess; measured, if one is undone
         self._left: dict[int, float] = {}  # Excess that the descent to a snapshot left, by the snapshot's number
 
     def start(self, target: Target) -> float:
@@ -119,7 +103,9 @@ class GridMaker:
         """See `Maker`: of the grid of a multiplier, without a refit or a descent of its own."""
         grid = self._before_refit(multiplier)
         if target.limit_bytes is not None:
-            return target.excess(self.size_of(grid), None) + (PRICED if self.steps else 0.0) - ABOVE
+            # A descent changes the log of the size by about -.035, since bits cost. We aim .02 above the size that was asked
+            # for, since results that are too large can be trimmed: docs/results/tuning.md#landing
+            return target.excess(self.size_of(grid), None) + (-0.035 if self.steps else 0.0) - 0.02
         return self._after(self._guess(values_of(grid, self.rounds.storage), target))
 
     def make(self, multiplier: float, target: Target) -> tuple[Candidate, GridScene]:
@@ -182,13 +168,14 @@ class GridMaker:
         """Prune and descend in turn, as often as the effort says.
 
         A descent that makes the views that decide worse, or leaves more than the target allows, is undone. If the first one makes
-        them worse, colours are refitted instead of all further descents.
+        them worse, colours are refitted instead of all further descents. A descent has half the steps of the one to a candidate,
+        and ends at a fifth of its first rates: docs/results/tuning.md#interleaved
         """
         by_size = target.limit_bytes is not None
         for fit in fits(self._interleaved) if by_size else [1.0] * self._interleaved:
             kept = self.selection.kept(self._prune(target, fit))
             pruned = self._fidelity(kept.planes)
-            schedule = self._schedule(INTERLEAVED_SHARE, pruned, last=INTERLEAVED_LAST)
+            schedule = self._schedule(0.5, pruned, last=0.2)
             self.rounds.renew(partial(self._off_grid, kept, schedule))
             self._slopes, planes, number = None, self.selection.last.planes, len(self.rounds.snapshots) - 1
             worse = self._fidelity(planes) < pruned
@@ -214,8 +201,9 @@ class GridMaker:
         def enough(last: Snapshot) -> bool:
             if limit is not None:
                 return last.count * self.selection.bits.base / 8 <= fit * limit
-            # The grid of a cut loses more than the last snapshot. It is not made in rounds far from the answer.
-            if len(self.rounds.snapshots) == 1 or self._after(self._guess(last.planes, target)) < PROBED_FROM:
+            # The grid of a cut loses more than the last snapshot. It is not made in rounds far from the answer: those whose
+            # snapshot is to lose less than exp(-1.2), three tenths, of what is allowed.
+            if len(self.rounds.snapshots) == 1 or self._after(self._guess(last.planes, target)) < -1.2:
                 return False
             multiplier = self.selection.cut()
             points.append((math.log(multiplier), self.probe(multiplier, target)))
@@ -348,13 +336,19 @@ class GridMaker:
     def _schedule(
         self, share: float, fidelity: float, last: float = Schedule.last, multiplier: float = 0.0
     ) -> Schedule:
-        """A descent with `share` of a candidate's steps, from planes of this fidelity."""
+        """A descent with `share` of a candidate's steps, from planes of this fidelity.
+
+        Beyond ten looks at each pose, rates fall with the root of the number: docs/results/tuning.md#full_passes
+        """
         passes = self.steps / len(self.rounds.original.cameras)
-        rate = min(math.sqrt(FULL_PASSES / passes), 1.0) * rate_from(fidelity)
+        rate = min(math.sqrt(10 / passes), 1.0) * rate_from(fidelity)
         return Schedule(math.ceil(share * self.steps), rate, last, multiplier=multiplier)
 
     def _finetune(self, kept: Kept, schedule: Schedule, step_sizes: StepSizes | None = None) -> Planes:
-        """A descent; where colours are clipped after it, a second one lets the other values make up for that."""
+        """A descent; where colours are clipped after it, a second one lets the other values make up for that.
+
+        It has half the steps, at a quarter of the rates: docs/results/tuning.md#clipped
+        """
 
         def descend(planes: Planes, schedule: Schedule) -> Planes:
             weight = structure_of(self._guess.ssim_margin)
@@ -366,8 +360,8 @@ class GridMaker:
         moved = descend(kept.planes, schedule)
         if step_sizes is None or self._most_colour == math.inf:
             return moved
-        steps = math.ceil(AGAIN_STEPS * schedule.iterations)
-        return descend(moved, replace(schedule, iterations=steps, rate=AGAIN_RATE * schedule.rate))
+        again = replace(schedule, iterations=math.ceil(schedule.iterations / 2), rate=schedule.rate / 4)
+        return descend(moved, again)
 
     def _refit_colours(self, planes: Planes, degrees: np.ndarray, times: int, bands: bool = True) -> Planes:
         subsets = self.effort.subsets_of(len(self.rounds.original.cameras))

@@ -12,8 +12,6 @@ from flexgs_edge.memory.storage import Storage
 from flexgs_edge.scene.curve import morton
 
 REACH = 0.04  # Largest log of size over limit that is landed. Beyond it, a new result at another multiplier is better.
-NEAR = 0.002  # How far below the limit, as a share of it, we are content
-TRIES = 4  # Most times that the file is coded on the way
 NEAR_QUALITY = 0.02  # How far below what it allows, as a share of it, we are content
 REFITTED, DESCENDED = (0.5, 1), (0.33, 6)
 """Share of the Gaussians to remove at first, for each unit of the log of what a quality allows, and most results that are made
@@ -22,13 +20,18 @@ docs/results/tuning.md#landing"""
 
 
 def land(
-    grid: GridScene, removal: np.ndarray, size: int, limit: int, size_of: Callable[[GridScene], int], storage: Storage
+    grid: GridScene,  # the result
+    removal: np.ndarray,  # [n] f64, cost of the removal of each of its rows, infinite for those that must stay
+    size: int,  # its bytes
+    limit: int,  # most bytes
+    size_of: Callable[[GridScene], int],  # bytes of a grid's file
+    storage: Storage,  # holds the new grid
+    tries: int = 4,  # most times that the file is coded on the way
+    near: float = 0.002,  # how far below the limit, as a share of it, we are content
 ) -> tuple[GridScene, int]:
     """Remove the Gaussians whose removal costs least, until the file just fits.
 
-    `grid`: the result. `removal`: [n] f64, cost of the removal of each of its rows, infinite for those that must stay.
-    `size`: its bytes. `limit`: most bytes. `size_of`: bytes of a grid's file. `storage`: holds the new grid. Returns
-    the grid and its bytes; those that were given if it fits already, is too large for this, or cannot be made to fit.
+    Returns the grid and its bytes; those that were given if it fits already, is too large for this, or cannot be made to fit.
     """
     if not 0.0 < math.log(size / limit) <= REACH:
         return grid, size
@@ -36,9 +39,9 @@ def land(
     landed, fits, out = None, _beyond(removal), 0
     # Bytes of a row: at first the mean, then what the rows removed so far have taken.
     each = size / grid.count
-    wanted = limit * (1 - NEAR / 2)
+    wanted = limit * (1 - near / 2)
     count, last = 0, size
-    for _ in range(TRIES):
+    for _ in range(tries):
         count = min(max(count + math.ceil((last - wanted) / each), out + 1), fits - 1)
         if count <= out:
             break
@@ -46,7 +49,7 @@ def land(
         last = size_of(smaller)
         if last <= limit:
             landed, fits = (smaller, last), count
-            if last >= (1 - NEAR) * limit:
+            if last >= (1 - near) * limit:
                 break
         else:
             out = count

@@ -23,15 +23,9 @@ from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.source import MemorySource, growth
 
-HALF = 0.485
-"""Share of the bits that stays when the last layer is cut off. It is below .5, so that half of a file's bytes hold the other
-layers and the header."""
 MOST_SORTED = 1 << 18  # So many rows may always be sorted. Of more, see `can_sort`.
 SORTED_ROW_BYTES = 41
 """Bytes of memory that sorting takes for each row, even if the scene lies in scratch files: see `worthiest`."""
-ROUND, LARGE_ROUND = 0.8, 0.5
-"""Share of the bits that stays before costs are measured again; of more than `MOST_SORTED` rows, the second. Removed Gaussians
-interact, so costs go out of date: docs/results/tuning.md#layers"""
 
 
 def can_sort(rows: int, original: int) -> bool:
@@ -44,7 +38,7 @@ def can_sort(rows: int, original: int) -> bool:
 
 def assign_layers(
     grid: GridScene,  # the scene to sort
-    parts: Sequence[float],
+    layers: int,  # how many to make, at least 2
     bits: BitModel,  # bits that the coder takes for a row of each SH degree
     renderer: Renderer,  # draws the views
     cameras: Sequence[Camera],  # the scored poses
@@ -52,16 +46,15 @@ def assign_layers(
 ) -> GridScene:
     """Sort the Gaussians into layers by cost of removal for each bit.
 
-    Costs are measured again after each fifth of the bits (of many rows, each half) on the decoded scene, because a cut file has
-    no refit. What is left is measured as large as viewers draw it (`growth`).
-    Gaussians that no pose sees come last.
+    Costs are measured again after each fifth of the bits on the decoded scene, because a cut file has no refit. What is left is
+    measured as large as viewers draw it (`growth`). Gaussians that no pose sees come last.
 
-    `parts`: share of the bits that stays when the last layer is cut off, then the last but one, and so on. One layer
-    more than shares is made. Returns the same Gaussians in the order of their layers.
+    Returns the same Gaussians in the order of their layers.
     """
     storage = renderer.storage
     planes, left, layer = values_of(grid, storage), np.arange(grid.count), np.zeros(grid.count, np.uint8)
-    for level, part in zip(range(len(parts), 0, -1), parts, strict=True):
+    part = 0.485  # Below .5, so that half of a file's bytes hold all layers but the last one, and the header
+    for level in range(layers - 1, 0, -1):
         layer[left] = level
         left = worthiest(planes, grid.sh_degrees, left, part, bits, renderer, cameras, grid.origin, progress)
         layer[left] = 0
@@ -79,12 +72,12 @@ def worthiest(
     cameras: Sequence[Camera],
     origin: np.ndarray,  # [3] f64, as in `SceneSource`
     progress: Progress = SILENT,
-    keep: float | None = None,
+    keep: float = 0.8,
 ) -> np.ndarray:
     """What stays of the rows `left` when all but `part` of their bits are gone, a part at a time. It is never empty.
 
     `renderer`, `cameras`, `progress`: as for `assign_layers`. `keep`: share of the bits that stays before costs are
-    measured again. Default: by the number of rows.
+    measured again, because removed Gaussians interact: docs/results/tuning.md#layers
     """
     storage = renderer.storage
     cost = np.array([bits.of_degree(degree) for degree in range(int(degrees.max(initial=0)) + 1)])
@@ -103,8 +96,7 @@ def worthiest(
         del costs, worth
         spent = spent[order]
         gone = np.cumsum(spent, out=spent)
-        stays = keep or (LARGE_ROUND if len(left) > MOST_SORTED else ROUND)
-        goal = gone[-1] - max(end, stays * gone[-1])
+        goal = gone[-1] - max(end, keep * gone[-1])
         left = np.delete(left, order[: min(int(np.searchsorted(gone, goal)) + 1, len(left) - 1)])
         del order, gone
         spent = cost[degrees[left]]

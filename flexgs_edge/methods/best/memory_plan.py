@@ -46,16 +46,8 @@ from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import format_size
 
-WORK_PLANES = 11
-"""Copies of its rows' planes (236 bytes a row at degree 3) that making a candidate holds for a moment. These are rows, codes,
-twice the values of codes, colours of the last refit and of this one, and twice the sums of the refit. With a
-smaller number, a scene of which nearly all rows stay would exceed its limit: docs/results/tuning.md#work_planes"""
-DESCENTS = 3
-"""Copies of the scene's stored planes that the values of all descents take. A strict target keeps more rows and needs fewer
-candidates: docs/results/tuning.md#descents"""
 SPILLED_ROW_BYTES = 24
 """Bytes of memory that each row of a scene in scratch files still takes for a moment: for choosing rows, and lists of rows."""
-SPOOL_ROW_BYTES = 52  # Bytes of the scratch file of sums (`ViewSums`) for each row that a view shows
 
 
 def expected_bytes(run: Run[CompressOptions]) -> int:
@@ -112,7 +104,8 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
     storage, budget.heap = ScratchStorage(folder, budget.limit), None
     budget.take("reading scratch files", READING_BYTES)  # until the process ends
     renderer.largest = largest
-    most = whole + SPOOL_ROW_BYTES * rows * len(scored) + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
+    spool = 52 * rows * len(scored)  # the scratch file of sums (`ViewSums`), if each view shows all rows
+    most = whole + spool + renderer.fit.ahead * AHEAD_ROW_BYTES * rows
     LOG.info(
         "%d Gaussians and the rounds of their search need %s in memory, %s are free: they go to scratch files in %s "
         "(at most %s; --scratch names another folder)",
@@ -132,7 +125,9 @@ def needed_bytes(
     if distils:
         # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
         sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
-        held += source.count * DESCENTS * stored_bytes(source.sh_degree)
+        # The values of all descents take at most three copies of the scene's planes: a strict target keeps more rows, but needs
+        # fewer candidates: docs/results/tuning.md#descents
+        held += source.count * 3 * stored_bytes(source.sh_degree)
     return held, _least_bytes(fit, size, source, sums, distils)
 
 
@@ -180,8 +175,12 @@ def row_bytes(sh_degree: int, keep: float, parts: int = PARTS) -> int:
     The larger of two extremes counts. Either the rounds go down to nothing, each keeping `keep` of the one before. Or
     nearly all rows stay: then there is one snapshot, and a candidate made of it. All other searches need less. The sums of
     `parts` sets of poses come on top.
+
+    Making a candidate holds eleven copies of its rows' planes for a moment: rows, codes, twice the values of codes, colours of
+    the last refit and of this one, and twice the sums of the refit. With fewer, a scene of which nearly all rows stay would
+    exceed its limit: docs/results/tuning.md#work_planes
     """
     planes = stored_bytes(sh_degree)
     snapshot = planes + snapshot_bytes(sh_degree)
     sums = max(parts, PARTS) * 8 * (2 + 4 * sh_degree)
-    return round(max(snapshot / (1 - keep), snapshot + WORK_PLANES * planes)) + sums
+    return round(max(snapshot / (1 - keep), snapshot + 11 * planes)) + sums

@@ -26,7 +26,7 @@ from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
 from flexgs_edge.methods.best.grid_maker import GridMaker
-from flexgs_edge.methods.best.layers import HALF, assign_layers, can_sort
+from flexgs_edge.methods.best.layers import assign_layers, can_sort
 from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
@@ -79,8 +79,8 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
         judges.decided()
         if run.options.layers is not None and run.options.layers > 1:
             with run.clock.stage("layers"):
-                parts = (HALF,) * (run.options.layers - 1)
-                grid = assign_layers(grid, parts, coder.bits(grid), renderer, poses.cameras, run.progress)
+                bits = coder.bits(grid)
+                grid = assign_layers(grid, run.options.layers, bits, renderer, poses.cameras, run.progress)
         settings = make_settings(run, search)
         preview = _preview(run, coder, renderer, poses.cameras, grid, settings)
         if output is None:

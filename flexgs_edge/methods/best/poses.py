@@ -9,7 +9,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import FARTHER, NEARER, at_distance, between
-from flexgs_edge.cameras.order import SAME_VIEW, covering_order, in_picture, nearest, squared_distances
+from flexgs_edge.cameras.order import GAIN_DIGITS, SAME_VIEW, covering_order, in_picture, nearest, squared_distances
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.io.ply import inria_dtype
 from flexgs_edge.methods.best.effort import EFFORTS, LARGEST_STEP, pixels_of, sampled_poses, sampling_steps
@@ -19,20 +19,12 @@ from flexgs_edge.run.few_poses import visible_depths
 from flexgs_edge.run.options import DEFAULT_MAX_DROP, CompressOptions
 from flexgs_edge.scene.source import SceneSource, some_positions, without_degrees
 
-LEAST = 1e-6  # Least weight of a pose
-STEP = 4  # Every fourth pixel in both directions is compared
-POWER = 4.8
-"""Power of the slope. The slope alone would minimise the mean drop; a higher power lifts the worst view, as a soft maximum
-does: docs/results/tuning.md#view_weights"""
-HALF_WAY = 0.0
-TURN = (NEARER, None, FARTHER, None, NEARER, None, FARTHER, HALF_WAY)
-"""What each of eight given poses gets: a pose at so many times the distance, or one half way to its nearest neighbour:
+TURN = (NEARER, None, FARTHER, None, NEARER, None, FARTHER, 0.0)
+"""What each of eight given poses gets: a pose at so many times the distance, or (0) one half way to its nearest neighbour:
 docs/results/tuning.md#margin. They come on top of the given poses; in place of them they would make files larger."""
 LEAST_GAIN = 0.2
 """A pose is needed if it adds at least this share of its own picture to what the scored ones see:
 docs/results/tuning.md#needed"""
-GAIN_DIGITS = 4  # Decimals in comparisons of what a pose adds
-NEIGHBOURS = 6  # A given pose and each of so many nearest ones make a pose half way between them, if that is needed
 BESIDE = 4  # So many given poses nearest to a view that lost too much make poses half way to it
 MOST_TIMES = 2  # Needed poses are at most so many times the given ones that are scored
 POINTS = 512  # Most points that tell what poses see
@@ -40,10 +32,6 @@ FINE = {"max_drop": 0.3, "min_fidelity": 42.0, "min_ratio": 30.0}
 """Targets stricter than these keep most SH of most Gaussians. Colours then have as many values
 as a part of the pixels, and a refit to that part would overfit. So such targets get every pixel of as many poses as the
 effort allows: docs/results/tuning.md#fine_drop"""
-COVERAGE_POSES = 32
-"""Poses that tell how much of the views the scene covers. All 220 of one scene took a tenth of the run."""
-BESIDE_FINER = 2.0
-"""How much finer than in the mean we look at poses beside a view that lost too much: docs/results/tuning.md#needed"""
 
 
 @dataclass(frozen=True)
@@ -72,6 +60,7 @@ def base_errors(
     cameras: Sequence[Camera],  # the views that decide
     photo: Callable[[int, np.ndarray], np.ndarray],
     base_psnr: float = DEFAULT_BASE_PSNR,  # as for `far_bases`
+    step: int = 4,  # every fourth pixel in both directions is compared
 ) -> np.ndarray:
     """[n] f64, mean squared error of the original against the photo of each view, or that of `far_bases`.
 
@@ -79,7 +68,7 @@ def base_errors(
     """
     errors, contrasts = [], []
     with renderer.load(source) as scene:
-        coarse = [camera.every(STEP) for camera in cameras]
+        coarse = [camera.every(step) for camera in cameras]
         for place, camera in enumerate(renderer.in_turn(scene, coarse)):
             image = np.clip(renderer.render(scene, camera), 0.0, 1.0)
             seen = photo(place, image)
@@ -90,10 +79,14 @@ def base_errors(
     return np.array([error if base is None else mse_of_psnr(base) for error, base in zip(errors, bases, strict=True)])
 
 
-def view_weights(slopes: np.ndarray) -> np.ndarray:
-    """[n] f64, above 0 to 1: how much an error counts in each scored pose, from `KnownErrors.slopes`."""
-    weights: np.ndarray = slopes**POWER
-    relative: np.ndarray = np.maximum(weights / weights.max(), LEAST)
+def view_weights(slopes: np.ndarray, power: float = 4.8, least: float = 1e-6) -> np.ndarray:
+    """[n] f64, `least` to 1: how much an error counts in each scored pose, from `KnownErrors.slopes`.
+
+    The slope alone would minimise the mean drop. A higher `power` of it lifts the worst view, as a soft maximum does:
+    docs/results/tuning.md#view_weights
+    """
+    weights: np.ndarray = slopes**power
+    relative: np.ndarray = np.maximum(weights / weights.max(), least)
     return relative
 
 
@@ -111,7 +104,7 @@ def margin_of(
     for camera, times in turns:
         if times:
             made.append(at_distance(camera, next(depths), times))
-        elif times == HALF_WAY and len(cameras) > 1:
+        elif times == 0.0 and len(cameras) > 1:
             others = [other for other in cameras if other is not camera]
             away = [float(np.square(other.center - camera.center).sum()) for other in others]
             made.append(between(camera, others[int(np.argmin(away))]))
@@ -216,12 +209,15 @@ def _gain(seen: _Seen, known: np.ndarray) -> float:
 def _pairs(
     given: Sequence[Camera], deciding: Sequence[Camera], there: _Others, points: np.ndarray, near: float
 ) -> list[tuple[Camera, Camera]]:
-    """Neighbours of which one at least would add enough itself: all others have enough poses round them."""
+    """The nearest six of each given pose that would itself add enough: all others have enough poses round them.
+
+    Views that decide and would add enough are paired with the given poses nearest to them.
+    """
     pairs: dict[tuple[int, int], None] = {}
     for place, camera in enumerate(given):
         own = _Seen(there.shown[place], there.ahead[place], there.away[place])
         if _gain(own, _known(own, there.without(place))) >= LEAST_GAIN:
-            for other in nearest(camera, given, NEIGHBOURS):
+            for other in nearest(camera, given, 6):
                 pairs[min(place, other), max(place, other)] = None
     found = [(given[first], given[second]) for first, second in pairs]
     scored = {id(camera) for camera in given}
@@ -247,11 +243,13 @@ class ScoredPoses:
     def beside(self, views: Sequence[Camera], renderer: Renderer, source: SceneSource) -> list[Camera]:
         """Further poses beside views that lost too much, and nearer and farther ones of these.
 
+        We look at them twice as finely as at others in the mean: docs/results/tuning.md#needed
+
         `views`: the views. `renderer`: with nothing loaded. `source`: the original.
         """
         poses = [pose for view in views for pose in poses_beside(view, self.given)]
         poses += margin_of(renderer, source, poses, self.given)
-        return sampled_poses(poses, [max(self.step / BESIDE_FINER, 1.0)] * len(poses))
+        return sampled_poses(poses, [max(self.step / 2, 1.0)] * len(poses))
 
 
 def scored_poses(
@@ -311,11 +309,11 @@ def scored_poses(
 def _coverage(renderer: Renderer, source: SceneSource, cameras: Sequence[Camera]) -> float:
     """Share of the pixels of all views that the scene covers, from every `LARGEST_STEP`-th pixel in both directions.
 
-    Of more than `COVERAGE_POSES` views, it looks at so many at least, evenly spread among them.
+    Of more than 32 views, it looks at so many at least, evenly spread among them: all 220 of one scene took a tenth of the run.
     """
     covered, pixels = 0.0, 0
     with renderer.load(without_degrees(source, 0)) as scene:
-        apart = max(len(cameras) // COVERAGE_POSES, 1)
+        apart = max(len(cameras) // 32, 1)
         few = [camera.every(LARGEST_STEP) for camera in cameras[::apart]]
         for camera in renderer.in_turn(scene, few):
             renderer.render_planes(scene, camera)

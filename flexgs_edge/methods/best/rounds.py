@@ -41,13 +41,15 @@ PARTS = 2
 """Each pruning round measures one of this many interleaved sets of cameras and reuses the sums of the others. One set
 is slower, four make files larger: docs/results/tuning.md#parts"""
 MOST_PARTS = 4
-PART_VIEWS = 48  # Many cameras make up to `MOST_PARTS` sets, if each has this many: docs/results/tuning.md#part_views
 SNAPSHOTS_HELD = 2  # So many of the last snapshots never let their planes go: docs/results/tuning.md#let_go
 
 
 def parts_of(views: int) -> int:
-    """How many interleaved sets so many scored poses make."""
-    return max(min(PARTS, views // LEAST_VIEWS), min(MOST_PARTS, views // PART_VIEWS), 1)
+    """How many interleaved sets so many scored poses make.
+
+    More than `PARTS` only if each has 48: docs/results/tuning.md#part_views
+    """
+    return max(min(PARTS, views // LEAST_VIEWS), min(MOST_PARTS, views // 48), 1)
 
 
 class PruneRounds:

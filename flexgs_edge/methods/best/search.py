@@ -22,18 +22,13 @@ from flexgs_edge.progress import LOG
 NEAREST = 0.1
 """A new point keeps this share of the interval between its neighbours away from both, since curves are not quite
 smooth."""
-MOST, MOST_TRIED = 4, 6
-"""Most candidates, and most of them with those that lost Gaussians; while none holds, and of a size, the second is the limit
-of both."""
-PROBES = 4  # Most probes before the first candidate
-AIM, FARTHER = -0.01, 0.05
-"""Log of the share that we aim at, and how much farther below 1 for each candidate in a row that missed."""
+MOST_TRIED = 6
+"""Most candidates with those that lost Gaussians; while none holds, and of a size, most candidates."""
+AIM = -0.01  # Log of the share that we aim at
 SLOPE, SIZE_SLOPE = 0.7, -0.45
 """Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
 docs/results/tuning.md#slope"""
 LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what is measured
-CLOSE_SIZE = 0.003  # A candidate that is smaller than asked by no more than this ends a search for a size
-LEAST_CHANGE = 1e-3  # Multipliers whose logs differ by less are the same
 
 
 def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.5) -> float:
@@ -146,7 +141,7 @@ class RateResult(Generic[Product]):
 def search(
     maker: Maker[Product],  # makes the candidates
     target: Target,  # what must hold
-    most: int = MOST,  # most candidates, if one of them holds
+    most: int = 4,  # most candidates, if one of them holds
     best_effort: bool = False,  # answer with the closest candidate if none holds
     on_step: Callable[[Candidate], None] | None = None,  # called with each candidate
 ) -> RateResult[Product]:
@@ -175,7 +170,8 @@ def search(
                     maker.discard(dropped[1])
             else:
                 maker.discard(product)
-            close = best[0].holds and best[0].excess > -(CLOSE_SIZE if by_size else maker.close)
+            # A size is close enough within .3 %.
+            close = best[0].holds and best[0].excess > -(0.003 if by_size else maker.close)
             if close or len(steps) >= (most if best[0].holds and not by_size else MOST_TRIED):
                 break
             lost = [] if best[0].holds else lost_views(target, step.measurement)
@@ -200,10 +196,10 @@ def search(
 
 
 def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
-    """Log of the multiplier whose candidate we expect just below the target, found by probes."""
+    """Log of the multiplier whose candidate we expect just below the target, found by at most four probes."""
     seen: list[tuple[float, float]] = []
     slope = SLOPE if target.limit_bytes is None else SIZE_SLOPE
-    for _ in range(PROBES):
+    for _ in range(4):
         excess = maker.probe(math.exp(place), target)
         if excess is None or abs(excess - AIM) < -AIM:
             break
@@ -213,7 +209,9 @@ def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
 
 
 def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
-    """Log of the multiplier of the next candidate; `None` if another one would not be better.
+    """Log of the multiplier of the next candidate; `None` if another one would not be better, or would be about the same.
+
+    For each candidate in a row that missed we aim 5 % farther below the target.
 
     `steps`: all so far, at least one. `target`: what must hold.
     """
@@ -221,10 +219,10 @@ def next_place(steps: Sequence[Candidate], target: Target) -> float | None:
     slope = SIZE_SLOPE if by_size else SLOPE
     misses = next((count for count, step in enumerate(reversed(steps)) if step.holds), len(steps))
     points = [(math.log(step.multiplier), step.excess) for step in steps]
-    place = next_point(weighed([(at, excess + FARTHER * misses) for at, excess in points]), slope, LARGEST_STRIDE)
+    place = next_point(weighed([(at, excess + 0.05 * misses) for at, excess in points]), slope, LARGEST_STRIDE)
     low, high = _bracket(points, slope)
     place = min(max(place, low), high)
-    return place if place > math.log(1e-30) and all(abs(place - at) > LEAST_CHANGE for at, _ in points) else None
+    return place if place > math.log(1e-30) and all(abs(place - at) > 1e-3 for at, _ in points) else None
 
 
 def _bracket(points: Sequence[tuple[float, float]], slope: float) -> tuple[float, float]:

@@ -19,8 +19,6 @@ from flexgs_edge.scene.source import Planes
 
 MOST_ROUNDS = 24  # Most rounds of pruning
 FEW = 16  # Of fewer Gaussians none goes in a round
-ALL_LEFT = 0.97
-"""A candidate that missed with this share of what a descent has left asks for more: see `Selection.missed`."""
 
 
 @dataclass
@@ -88,11 +86,11 @@ class Selection:
     def missed(self, kept: Kept) -> None:
         """Tell of a candidate that missed.
 
-        If it has about all that a descent left, a finer grid may do. After the second such miss, rows are chosen from what the
-        descent before left.
+        If it has about all that a descent left (97 %), a finer grid may do. After the second such miss, rows are chosen from what
+        the descent before left.
         """
         begin = self.begin
-        if kept.snapshot != begin or len(kept.rows) < ALL_LEFT * self.rounds.snapshots[begin].count:
+        if kept.snapshot != begin or len(kept.rows) < 0.97 * self.rounds.snapshots[begin].count:
             return
         if begin in self.missed_once:
             self.begin = max((number for number in self.rounds.renewed if number < begin), default=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import os
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from flexgs_edge.memory.storage import ScratchStorage
 from flexgs_edge.methods.best import effort, grid_maker
 from flexgs_edge.methods.best import method as best_method
 from flexgs_edge.methods.best.effort import EFFORTS
-from flexgs_edge.methods.best.grid_maker import INTERLEAVED_SHARE, GridMaker
+from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.refit.finetune import Schedule
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.views.references import Original
@@ -118,9 +117,8 @@ def test_descents_between_the_rounds_are_not_done_again(
 ) -> None:
     steps = 100
     monkeypatch.setattr(effort, "LEAST_STEPS", steps)
-    monkeypatch.setitem(EFFORTS, "balanced", replace(EFFORTS["balanced"], interleaved=2, descends=0))
     # Pruning stops early, so that fine-tuning leaves less than the target allows.
-    monkeypatch.setattr(grid_maker, "DISTILLED", 3.0)
+    monkeypatch.setitem(EFFORTS, "balanced", replace(EFFORTS["balanced"], interleaved=2, descends=0, finetuned=3.0))
     words: dict[str, Any] = {**TINY, "effort": "balanced"}
     compress(project / "point_cloud.ply", tmp_path / "a.fgs", **words)
     words = {**words, "resume": True, "scratch": str(tmp_path)}
@@ -138,7 +136,7 @@ def test_descents_between_the_rounds_are_not_done_again(
     monkeypatch.setattr(GridMaker, "make", stop)
     with pytest.raises(Stop):
         compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
-    between = [math.ceil(INTERLEAVED_SHARE * steps)] * 2
+    between = [steps // 2] * 2
     assert moved == between
     monkeypatch.setattr(GridMaker, "make", whole)
     compress(project / "point_cloud.ply", tmp_path / "b.fgs", **words)
