@@ -23,9 +23,9 @@ from flexgs_edge.codec.v2.container import channel_bytes, coded_size, write_grid
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
+from flexgs_edge.grid.grid_scene import from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.io.ply import PlySource
 from flexgs_edge.methods.best.grid_coder import bit_model
 from flexgs_edge.scene.fields import FIELD

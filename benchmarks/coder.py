@@ -18,10 +18,9 @@ from benchmarks.harness import SCENES, Timer, check
 from flexgs_edge.codec.v2.container import channel_bytes, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.constants import DEFAULT_NEAR
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import recolour, to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.tested import open_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.choose_steps import CHROMA

@@ -19,7 +19,7 @@ from flexgs_edge.progress import LOG, SILENT, Progress, Stopwatch
 from flexgs_edge.report.results import BatchItem, BatchResult, CompressResult
 from flexgs_edge.run.open_scene import GZ, SUFFIXES, scene_file
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, CompressOptions
-from flexgs_edge.run.outputs import check_output
+from flexgs_edge.run.run import check_output
 
 OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "cameras": (None, AUTO_CAMERAS, NO_CAMERAS),

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.cameras.json_values import Entry, kind, load_json
 from flexgs_edge.cameras.start import START, StartView
 from flexgs_edge.codec.open_fgs import file_version, read_header
 from flexgs_edge.codec.v1.container import Header, write_container
 from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
-from flexgs_edge.errors import BudgetError, DeviceError, InputError
+from flexgs_edge.errors import BudgetError, DeviceError, FormatError, InputError, brief
 from flexgs_edge.files import atomic_folder, atomic_write, check_folder, check_writable
 from flexgs_edge.methods.paper.prune import nonzero_sh
 from flexgs_edge.packed.bitpack import BitSpec
@@ -35,7 +36,6 @@ from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.units import format_size
 from flexgs_edge.viewer.assets import CROP, PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
-from flexgs_edge.viewer.notes import read_notes
 from flexgs_edge.viewer.scene_page import COMMAND, page_config, site_files, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
@@ -44,6 +44,7 @@ FINE = BitSpec(xyz=16, dc=16, scale=16, rot=16, opacity=16, rest=16)
 _SCENE_NAME = "scene.fgs"
 _SCENE = f"viewer/{_SCENE_NAME}"
 PAGE_MOST = 100_000_000  # Bytes of a page that phones and mail still take
+NOTES_MOST = 1000  # Most notes of a page, which places all of them with every frame
 POSTER_SIZE, POSTER_QUALITY = (960, 540), 70  # It comes before the scene on slow networks, so it is small
 
 
@@ -191,3 +192,23 @@ def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path
         start = run.scene.start if run.views is None else run.views.start(source)
         write_container(folder / "scene.fgs", quantized, {} if start is None else {START: start.to_json()})
         yield folder / "scene.fgs"
+
+
+def read_notes(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """Read a JSON list of objects with `at` (three numbers, world coordinates) and `text`.
+
+    Raises `InputError` if the file cannot be read, and `FormatError` for any other content.
+    """
+    found = load_json(Path(path), "the notes")
+    if not isinstance(found, list):
+        raise FormatError(f"{path}: expected a list of notes, found {kind(found)}")
+    if len(found) > NOTES_MOST:
+        raise FormatError(f"{path}: expected at most {NOTES_MOST} notes, found {len(found)}")
+    return [_note(Entry(f"{path}: note {number}", note)) for number, note in enumerate(found, 1)]
+
+
+def _note(entry: Entry) -> dict[str, Any]:
+    at, text = entry.array("at", (3,)), entry.get("text")
+    if not isinstance(text, str) or not text.strip():
+        raise entry.fail("text", "a text", brief(text))
+    return {"at": at.tolist(), "text": text}

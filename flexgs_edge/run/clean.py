@@ -1,17 +1,24 @@
 """`--clean`: leave out what clouds views, or lies where nothing else is, and say what that did to the views.
 
-Photos judge each Gaussian by the change of the squared error when it goes (`views/changes`). What stands in the light of a
+Photos judge each Gaussian by the change of the squared error when it goes (`measure_changes`). What stands in the light of a
 floater seems to disturb too, so those that gain most go first, and the rest are measured again. What views hardly see is
 judged by how isolated it is.
+
+A pixel is linear in the alpha of one Gaussian, so taking it away takes its light e away: what the target has more than the view,
+r, becomes r + e. The squared error changes by e^2 + 2 r e. A descent's gradient has the second part, but for the few
+pixels where alpha is capped.
 """
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.constants import FIXED_ERROR, FIXED_WEIGHT
 from flexgs_edge.io.exchange import wants_double
 from flexgs_edge.io.ply import write_ply
-from flexgs_edge.progress import LOG
+from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.psnr import exposure_gains, mse_of_psnr, with_gains
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.statistics import Statistics
@@ -22,9 +29,9 @@ from flexgs_edge.run.reporter import Reporter
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.check import alive
 from flexgs_edge.scene.crop import usual_bounds
-from flexgs_edge.scene.isolation import isolation
-from flexgs_edge.scene.source import SelectSource, some_positions
-from flexgs_edge.views.changes import Changes, measure_changes
+from flexgs_edge.scene.isolation import isolation, usual_deviation
+from flexgs_edge.scene.source import SceneSource, SelectSource, some_positions
+from flexgs_edge.views.sums import view_parts
 
 CHANCE = 8.0
 """A Gaussian contradicts the photos if the views gain so many times what chance gives it, and more than `NOTHING`."""
@@ -36,9 +43,34 @@ THOROUGH_LOSS = 0.01  # A kind may cost the views that report so much, dB
 NEAR, NEEDLE, GIANT = 0.25, 20.0, 0.25
 """Words for what goes: nearer to a camera than this share of what it usually has before it, so many times longer than wide, or
 larger than this share of the scene."""
+SLOPE = 3  # Plane of sum(r e) in the sums of a gradient
 ROW_BYTES = 160  # Bytes a row while neighbours are looked for, or changes added up
 KINDS = ("invisible", "near cameras", "needles", "giants", "floaters", "isolated", "unseen and isolated")
 INVISIBLE, FLOATERS, LONE, UNSEEN = 0, 4, 5, 6
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Sums over pixels, three channels and views."""
+
+    # [N] f64, sum(e^2): what removal would cost if the targets were the views; 0 for rows that no view sees.
+    cost: np.ndarray
+    slope: np.ndarray  # [N] f64, sum(r e): below 0 where the targets lack this light
+    error: float  # squared error of the views against their targets
+
+    @property
+    def total(self) -> np.ndarray:
+        """[N] f64, change of the squared error when this row alone goes: a gain below 0."""
+        total: np.ndarray = self.cost + 2 * self.slope
+        return total
+
+    @property
+    def chance(self) -> np.ndarray:
+        """[N] f64, the gain that chance gives: what targets and views differ by is noise for most rows."""
+        light = np.sqrt(self.cost)
+        seen = light > 0
+        chance: np.ndarray = 2 * usual_deviation(self.slope[seen] / light[seen]) * light
+        return chance
 
 
 def cleaned(run: Run[CompressOptions], renderer: Renderer) -> Run[CompressOptions]:
@@ -186,3 +218,36 @@ def _loss(run: Run[CompressOptions], renderer: Renderer, judge: QualityEvaluator
     with renderer.load(SelectSource(run.source, np.flatnonzero(~gone))) as scene:
         quality = judge.compare(scene, progress=run.progress)
     return quality.covered_modelled_drop if quality.drop is None else quality.drop
+
+
+def measure_changes(
+    renderer: Renderer,
+    source: SceneSource,
+    cameras: Sequence[Camera],
+    target: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    progress: Progress = SILENT,
+) -> Changes:
+    """Measure changes in one pass over some views.
+
+    `target`: gives the target of a view, [H, W, 3] f32, from its place among the cameras and its render, clamped. Default: the
+    render itself. Nothing is loaded afterwards.
+    """
+    cost, slope, error = np.zeros(source.count), np.zeros(source.count), 0.0
+    with renderer.load(source, references=True) as scene:
+        views = progress.track(renderer.in_turn(scene, cameras), "measuring what to clean", len(cameras))
+        for place, camera in enumerate(views):
+            for rows, sums in view_parts(renderer, scene, renderer.removal_sums(scene, camera)):
+                cost[rows] += sums[:, 0] / FIXED_ERROR
+            if target is None:
+                continue
+            planes = renderer.drawn_planes()
+            within = np.s_[:, : camera.height, : camera.width]
+            image = planes[within].clip(0.0, 1.0).transpose(1, 2, 0)
+            wanted = target(place, image)
+            error += float(np.square(wanted - image).sum(dtype=np.float64))
+            half = np.zeros(planes.shape, np.float16)
+            half[within] = wanted.transpose(2, 0, 1)
+            for rows, sums in view_parts(renderer, scene, renderer.gradient_sums(scene, camera, half)):
+                slope[rows] += sums[:, SLOPE] / FIXED_WEIGHT
+    renderer.release()
+    return Changes(cost, slope, error)

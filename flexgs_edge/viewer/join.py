@@ -1,4 +1,4 @@
-"""Join modules of JavaScript into one script, for a page that may load nothing.
+"""Join modules of JavaScript into one short script, for a page that may load nothing.
 
 Only the forms of `import` and `export` that our own modules use are understood; a test joins all of them.
 """
@@ -7,8 +7,7 @@ import posixpath
 import re
 from collections.abc import Mapping
 from importlib.util import find_spec
-
-from flexgs_edge.viewer.shaders import shorten_shader
+from string import ascii_letters
 
 _SHADER = re.compile(r"`#version[^`]*`")
 _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
@@ -17,6 +16,9 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", 
 _NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
 _NUMBER = re.compile(r"^const ([A-Z][A-Z0-9_]*) = (\d[0-9a-fx .*/<-]*);\n", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
+_OUTSIDE = re.compile(r"\b(?:uniform|in|out) [^;(){}]*;")  # Names that the page or another shader of GLSL knows
+_DECLARED = re.compile(r"\b(?:float|int|u?vec[234]|mat3|void) (\w+)|, (\w+) = ")
+_DIGITS = re.compile(r"\d+\.\d{9,}")
 
 
 def shorten_script(text: str) -> str:
@@ -96,3 +98,24 @@ def _check_names(parts: Mapping[str, str]) -> None:
             if name in owners:
                 raise ValueError(f"{path} and {owners[name]} both have {name}")
             owners[name] = path
+
+
+def shorten_shader(text: str) -> str:
+    """A shader without comments, indentation and most spaces, with short names and no digits that float32 cannot hold."""
+    text = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
+    text = _DIGITS.sub(lambda found: f"{float(found[0]):.9g}", _renamed(text))
+    text = re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", text)
+    # Two signs beside each other would become another one.
+    return re.sub(r"(?<![+-]) ?([+-]=?) ?(?![+-])", r"\1", text)
+
+
+def _renamed(text: str) -> str:
+    """A shader with names of one letter."""
+    used = set(re.findall(r"\w+", text))
+    known = set(re.findall(r"\w+", " ".join(_OUTSIDE.findall(text)))) | {"main"}
+    declared = [one or other for one, other in _DECLARED.findall(_OUTSIDE.sub("", text))]
+    own = [name for name in dict.fromkeys(declared) if name not in known and len(name) > 1]
+    free = (letter for letter in ascii_letters if letter not in used)
+    for old, new in zip(own, free, strict=False):
+        text = re.sub(rf"(?<![.\w]){old}\b", new, text)
+    return text

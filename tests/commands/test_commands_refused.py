@@ -127,7 +127,7 @@ def test_invalid_rows_are_refused_or_dropped_with_a_count(project: Path, tmp_pat
 def test_a_result_larger_than_its_input_is_not_written(
     tmp_path: Path, done: tuple[Path, CompressResult], project: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexgs_edge.run.outputs.LEAST_REFUSED", 1000)
+    monkeypatch.setattr("flexgs_edge.run.run.LEAST_REFUSED", 1000)
     small = compress(project, tmp_path / "small.fgs", max_size=4000, **FAST).size
     words: dict[str, Any] = {**FAST, "method": method, "cameras": str(project / "cameras.json"), "images": "none"}
     finer = (

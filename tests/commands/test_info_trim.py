@@ -22,8 +22,7 @@ from flexgs_edge.commands.render import render_views
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.commands.verify import verify
 from flexgs_edge.errors import FormatError, InputError, TargetError
-from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.values import from_grid
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.scene.source import GrownSource

@@ -17,10 +17,9 @@ from flexgs_edge.codec.sections import HeaderError, checked_contraction
 from flexgs_edge.codec.v1.container import write_container
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.grid.step_sizes import StepSizes, position_grid
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.packed.quantize import QuantizedScene, far_contraction, quantize_scene
 from flexgs_edge.render.renderer import Renderer

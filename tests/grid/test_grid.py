@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from flexgs_edge.errors import InputError
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.curve import morton
 from flexgs_edge.scene.rotations import canonical_axes
 from grid_scenes import STEPS, make_grid, make_planes

@@ -57,7 +57,7 @@ def copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("layers", "attic.py", "A_MODULE = 'that nobody gave a floor'"),
         ("methods", "methods/best/poses.py", "import flexgs_edge.methods.paper.method"),
         ("codec", "codec/v1/container.py", "import flexgs_edge.codec.v2.header"),
-        ("codec_v2", "codec/v2/octree.py", "import flexgs_edge.codec.v2.walk"),
+        ("codec_v2", "codec/v2/tables.py", "import flexgs_edge.codec.v2.walk"),
         ("views", "views/references.py", "import flexgs_edge.views.sums"),
         ("render", "render/fit.py", "import flexgs_edge.render.chunks"),
         ("bytes", "io/ply.py", "import flexgs_edge.quality.psnr"),

@@ -10,9 +10,9 @@ from test_kernels_twins import padded_target
 
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.grid.grid_scene import from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.twins.descend import price_bits
 from flexgs_edge.methods.best.refit.descent import ORDER, WIDE, WIDTH, Descent, bit_prices
 from flexgs_edge.methods.best.refit.finetune import FIELD_RATES

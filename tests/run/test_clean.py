@@ -22,13 +22,12 @@ from flexgs_edge.errors import InputError
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.run.clean import cleaned
+from flexgs_edge.run.clean import cleaned, measure_changes
 from flexgs_edge.run.open_renderer import open_renderer
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.run import Run, open_run, planned
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource, SceneSource, SelectSource, read_all
-from flexgs_edge.views.changes import measure_changes
 from scene_files import open_scene
 from tiny_project import COUNT, FAST, make_project
 

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from flexgs_edge.codec.v2.container import write_grid
-from flexgs_edge.commands.view import view
+from flexgs_edge.commands.view import NOTES_MOST, read_notes, view
 from flexgs_edge.errors import InputError
-from flexgs_edge.viewer.notes import NOTES_MOST, read_notes
 from grid_scenes import make_grid
 
 GOOD = {"at": [1, 2.5, -3], "text": "</script><b>"}

@@ -10,8 +10,7 @@ import pytest
 
 from flexgs_edge.viewer import join as shorten
 from flexgs_edge.viewer.assets import web_files
-from flexgs_edge.viewer.join import shorten_script, shorten_style
-from flexgs_edge.viewer.shaders import shorten_shader
+from flexgs_edge.viewer.join import shorten_script, shorten_shader, shorten_style
 
 
 def test_shaders_lose_what_only_readers_need() -> None:

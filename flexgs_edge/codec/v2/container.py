@@ -32,11 +32,9 @@ from flexgs_edge.codec.v2.header import (
     encode_header,
     least_bytes,
 )
-from flexgs_edge.codec.v2.model import Model
-from flexgs_edge.codec.v2.octree import TooManyNodes
-from flexgs_edge.codec.v2.ports import DecodePort
+from flexgs_edge.codec.v2.ports import DecodePort, Model
 from flexgs_edge.codec.v2.rans import Decoder, StreamError, lane_count
-from flexgs_edge.codec.v2.walk import ChunkCodes, walk_chunk
+from flexgs_edge.codec.v2.walk import ChunkCodes, TooManyNodes, walk_chunk
 from flexgs_edge.errors import InputError, TargetError
 from flexgs_edge.files import atomic_write
 from flexgs_edge.grid.grid_scene import GridScene

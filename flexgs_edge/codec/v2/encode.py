@@ -12,8 +12,7 @@ from flexgs_edge.codec.v2.device.launch import Device
 from flexgs_edge.codec.v2.fit_groups import fit_group
 from flexgs_edge.codec.v2.groups import Group
 from flexgs_edge.codec.v2.header import CHUNK_ROWS, Chunk, least_bytes, plan_chunks
-from flexgs_edge.codec.v2.model import SHARED, Model, group_kinds, tables_of
-from flexgs_edge.codec.v2.ports import UNIFORM, Batch, CountPort, FitPort
+from flexgs_edge.codec.v2.ports import SHARED, UNIFORM, Batch, CountPort, FitPort, Model, group_kinds, tables_of
 from flexgs_edge.codec.v2.rans import Encoder, lane_count
 from flexgs_edge.codec.v2.tables import CLASSES, LEVELS, OFTEN, WEIGHTS, level_batches, merge_contexts, to_levels
 from flexgs_edge.codec.v2.threads import in_order, thread_count

@@ -17,8 +17,7 @@ from flexgs_edge.codec.v2.header import Chunk
 from flexgs_edge.codec.v2.threads import in_order, thread_count
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT
-from flexgs_edge.grid.grid_scene import CODES, GridScene
-from flexgs_edge.grid.values import from_grid
+from flexgs_edge.grid.grid_scene import CODES, GridScene, from_grid
 from flexgs_edge.scene.check import SH_LARGEST
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 

@@ -13,11 +13,10 @@ import numpy as np
 from flexgs_edge.goals.promise import excesses
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, values_of
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
-from flexgs_edge.grid.values import values_of
-from flexgs_edge.methods.best.allocation import BitModel, choose
+from flexgs_edge.methods.best.allocation import BitModel, Guess, Kept, Measure, Selection, choose
 from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
 from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
@@ -26,7 +25,6 @@ from flexgs_edge.methods.best.refit.colour import refit_colours
 from flexgs_edge.methods.best.refit.finetune import Schedule, finetune, structure_of
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import LARGEST_STRIDE, SLOPE, Candidate, next_point
-from flexgs_edge.methods.best.selection import Guess, Kept, Measure, Selection
 from flexgs_edge.render.fit import sum_bytes
 from flexgs_edge.scene.source import MemorySource, Planes
 

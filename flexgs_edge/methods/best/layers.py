@@ -11,8 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.values import values_of
+from flexgs_edge.grid.grid_scene import GridScene, values_of
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.costs import cost_bytes, measure_costs

@@ -20,8 +20,8 @@ from flexgs_edge.errors import TargetError
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import Choice, Scored, SearchResult, Step, step_words
 from flexgs_edge.goals.target import Measurement
-from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.values import values_of
+from flexgs_edge.grid.grid_scene import GridScene, values_of
+from flexgs_edge.methods.best.allocation import Measure
 from flexgs_edge.methods.best.checkpoint import Checkpoint, open_checkpoint
 from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_coder import GridCoder, projected_size, with_preview
@@ -33,7 +33,6 @@ from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, search
-from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
@@ -42,9 +41,8 @@ from flexgs_edge.run.evaluators import Evaluators
 from flexgs_edge.run.few_poses import usual_depth
 from flexgs_edge.run.method_result import MethodResult, make_settings, settings_room
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
-from flexgs_edge.run.run import Run
+from flexgs_edge.run.run import Run, check_smaller
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.references import Original, References

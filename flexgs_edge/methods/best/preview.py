@@ -16,10 +16,9 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, values_of
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.grid.values import values_of
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.methods.best.choose_steps import holdable

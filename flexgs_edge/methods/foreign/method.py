@@ -12,17 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from flexgs_edge.files import check_writable
-from flexgs_edge.grid.grid_scene import GridScene
-from flexgs_edge.grid.values import values_of
+from flexgs_edge.grid.grid_scene import GridScene, values_of
 from flexgs_edge.io.exchange import read_foreign, write_foreign
 from flexgs_edge.io.formats import Format
-from flexgs_edge.methods.best.allocation import BitModel, OneDegree, choose
+from flexgs_edge.methods.best.allocation import BitModel, Measure, OneDegree, choose
 from flexgs_edge.methods.best.effort import effort_of
 from flexgs_edge.methods.best.grid_maker import GridMaker
 from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.method import MakerOf, See, choose_poses, search_best
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.selection import Measure
 from flexgs_edge.progress import LOG
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.evaluators import Evaluators

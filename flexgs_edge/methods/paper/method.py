@@ -37,9 +37,8 @@ from flexgs_edge.run.fingerprint import fingerprint
 from flexgs_edge.run.method_result import MethodResult, make_settings
 from flexgs_edge.run.open_renderer import drawing_bytes
 from flexgs_edge.run.options import CompressOptions
-from flexgs_edge.run.outputs import check_smaller
 from flexgs_edge.run.quality_evaluator import QualityEvaluator, measurement_of
-from flexgs_edge.run.run import Run
+from flexgs_edge.run.run import Run, check_smaller
 from flexgs_edge.scene.source import SceneSource
 from flexgs_edge.units import format_size
 

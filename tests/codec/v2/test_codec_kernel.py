@@ -18,14 +18,13 @@ from flexgs_edge.codec.v2.device.launch import INFO, Device
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.codec.v2.header import CHUNK_ROWS
-from flexgs_edge.codec.v2.model import Model
+from flexgs_edge.codec.v2.ports import Model
 from flexgs_edge.codec.v2.walk import ChunkCodes
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.constants import CODE_LIMIT
 from flexgs_edge.errors import FormatError
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.choose_device import DeviceInfo
 from flexgs_edge.kernels.opencl import OpenCLBackend

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from flexgs_edge.codec.v2 import fit_groups
 from flexgs_edge.codec.v2.container import decode_chunk
 from flexgs_edge.codec.v2.encode import cells_of, chunk_codes, encode_grid
-from flexgs_edge.codec.v2.model import Model
-from flexgs_edge.codec.v2.octree import TooManyNodes
-from flexgs_edge.codec.v2.ports import FitPort
+from flexgs_edge.codec.v2.ports import FitPort, Model
 from flexgs_edge.codec.v2.rans import StreamError
+from flexgs_edge.codec.v2.walk import TooManyNodes
 from flexgs_edge.errors import InputError
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.rows import blocks

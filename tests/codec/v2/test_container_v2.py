@@ -23,9 +23,8 @@ from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
 from flexgs_edge.commands.decompress import decompress
 from flexgs_edge.errors import FormatError, InputError, TargetError
-from flexgs_edge.grid.grid_scene import GridScene
+from flexgs_edge.grid.grid_scene import GridScene, from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.scene.check import check_scene
 from flexgs_edge.scene.fields import FIELDS
 from grid_scenes import assert_same_grid, make_grid

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexgs_edge.codec.v2.octree import CONTEXTS, TooManyNodes, unmorton, walk_octree
+from flexgs_edge.codec.v2.walk import OCTREE_CONTEXTS, TooManyNodes, unmorton, walk_octree
 from flexgs_edge.scene.curve import morton
 
 
@@ -21,7 +21,7 @@ def test_round_trip(count: int, depth: int) -> None:
 
     def write(contexts: np.ndarray, symbols: np.ndarray | None) -> np.ndarray:
         assert symbols is not None and symbols.all() and len(contexts) == len(symbols)
-        assert contexts.max() < CONTEXTS
+        assert contexts.max() < OCTREE_CONTEXTS
         batches.append(symbols)
         return symbols
 

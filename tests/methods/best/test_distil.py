@@ -16,9 +16,9 @@ from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.commands.compress import compress
 from flexgs_edge.errors import BudgetError, InputError
+from flexgs_edge.grid.grid_scene import from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
-from flexgs_edge.grid.values import from_grid
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours

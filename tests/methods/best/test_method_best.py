@@ -19,7 +19,7 @@ from flexgs_edge.commands.evaluate import evaluate
 from flexgs_edge.commands.info import info
 from flexgs_edge.commands.trim import trim
 from flexgs_edge.errors import BudgetError, InputError, TargetError
-from flexgs_edge.grid.values import from_grid
+from flexgs_edge.grid.grid_scene import from_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.grid_coder import GridCoder, bit_model

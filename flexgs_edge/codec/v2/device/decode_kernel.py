@@ -23,10 +23,9 @@ from flexgs_edge.codec.v2.device.launch import (
     padded,
 )
 from flexgs_edge.codec.v2.header import check_end
-from flexgs_edge.codec.v2.model import SHARED, Model
-from flexgs_edge.codec.v2.octree import TooManyNodes
+from flexgs_edge.codec.v2.ports import SHARED, Model
 from flexgs_edge.codec.v2.rans import StreamError, first_states, lane_count
-from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
+from flexgs_edge.codec.v2.walk import ChunkCodes, TooManyNodes, base_kinds
 from flexgs_edge.constants import CODE_LIMIT, RANS_LANES
 from flexgs_edge.constants import RANS_PRECISION as PRECISION
 from flexgs_edge.grid.step_sizes import StepSizes

@@ -18,8 +18,7 @@ from flexgs_edge.codec.v2.device.launch import (
     padded,
 )
 from flexgs_edge.codec.v2.groups import Group
-from flexgs_edge.codec.v2.model import SHARED
-from flexgs_edge.codec.v2.ports import CountPort, Raw
+from flexgs_edge.codec.v2.ports import SHARED, CountPort, Raw
 from flexgs_edge.codec.v2.rans import Encoder
 from flexgs_edge.codec.v2.walk import ChunkCodes, base_kinds
 from flexgs_edge.constants import COARSE_ROWS, RANS_LANES
