@@ -4,9 +4,8 @@ The Python API has the words of the command line::
 
     import flexgs_edge
 
-    result = flexgs_edge.compress("point_cloud.ply", "scene.fgs", max_drop=1.0)
-    print(result.size, result.quality.drop)
-    arrays = flexgs_edge.decode("scene.fgs").arrays()
+    result = flexgs_edge.compress("point_cloud.ply", "scene.fgs", max_drop=1.0) print(result.size, result.quality.drop) arrays =
+    flexgs_edge.decode("scene.fgs").arrays()
 
 Names are imported when they are first used, so that ``import flexgs_edge`` costs nothing. ``__init__.pyi`` lists them.
 `render` and `views` are rooms of the package, hence `render_views` and `draw_sheet`.

@@ -31,9 +31,8 @@ DEFAULT_NEAR: Final = 0.2  # Near plane in scene units; Gaussians with a camera 
 DILATION: Final = 0.3
 """Added to both diagonal terms of the 2D covariance, in px^2, so that no splat gets thinner than a pixel."""
 SHARE_MIN: Final = 1.0 / 255.0**2
-"""Smallest ratio det before / det after the dilation that can show: opacity is at most 1, and its factor is the square
-root. The reference program floors the factor at 0.005 instead. That leaves splats of opacity above 0.784 at alpha
-0.0039 to 0.005."""
+"""Smallest ratio det before / det after the dilation that can show: opacity is at most 1, and its factor is the square root.
+The reference program floors the factor at 0.005 instead. That leaves splats of opacity above 0.784 at alpha 0.0039 to 0.005."""
 FACTOR_MIN: Final = 1e-30
 """Rows of a covariance's factor with a squared length (scene units^2) below this count as zero."""
 JACOBIAN_MARGIN: Final = 0.15
@@ -51,8 +50,7 @@ LOG2_ALPHA_MIN: Final = -LOG2_255
 """We compare the exponent of a splat at a pixel, not its alpha. In float32, this is the least x with a computed 2^x of
 ALPHA_MIN or more. For smaller x, 2^x is not used and need not be right."""
 LOG2_ALPHA_MAX: Final = -0.0144997
-"""Cap on the exponent, in place of alpha: the computed 2^x is ALPHA_MAX to the bit. For log2(ALPHA_MAX) it is an ulp
-more."""
+"""Cap on the exponent, in place of alpha: the computed 2^x is ALPHA_MAX to the bit. For log2(ALPHA_MAX) it is an ulp more."""
 
 # --- extents ----------------------------------------------------------------------------------
 EXTENT_SLACK: Final = 4e-6
@@ -100,15 +98,13 @@ LOG2_POLY: Final = (
 )  # log2(1 + f) = f * P(f) on f in [-1/3, 1/3): absolute error 7.1e-8 in float32 (our own Chebyshev fit)
 
 DEQUANTIZE_ROWS: Final = 64
-"""Rows of a work-item of the dequantize kernel: one division finds its group, and there are enough items for all
-units."""
+"""Rows of a work-item of the dequantize kernel: one division finds its group, and there are enough items for all units."""
 
 # --- reductions -------------------------------------------------------------------------------
 FIXED_WEIGHT: Final = 2.0**32
 FIXED_ERROR: Final = 2.0**40
-"""Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors. Any order of additions
-gives the same bits. The weight of a pixel is at most 1. Errors get finer units, since small splats decide what is
-pruned first."""
+"""Units of the 64-bit fixed-point sums over tiles and views, of weights and of squared errors. Any order of additions gives the
+same bits. The weight of a pixel is at most 1. Errors get finer units, since small splats decide what is pruned first."""
 FIXED_MOMENT: Final = 2.0**26
 """Units of the gradient's moments about a splat's centre, in pixels and squared pixels. The sum wraps only beyond
 1.3e11: a splat that fills an image of 2000 pixels a side, which lacks a tenth of its light everywhere."""
@@ -160,8 +156,7 @@ RANS_TOTAL: Final = 1 << RANS_PRECISION  # Sum of the frequencies of a table
 RANS_FLOOR: Final = 1 << 16  # Smallest state between symbols, and the first state of every lane
 RANS_LANES: Final = 512  # Most lanes of a stream
 LEVEL_CLASSES: Final = 6
-"""Classes of octree levels by their distance from the cells. All coarser levels share the last class: they have few
-nodes."""
+"""Classes of octree levels by their distance from the cells. All coarser levels share the last class: they have few nodes."""
 CHILD_CLASSES: Final = 5
 """Classes of octree nodes by the number of the parent's children: none (the root), 1, 2, 3, more."""
 COARSE_ROWS: Final = 256  # Most rows of the first pass over a chunk; these rows have no neighbours yet

@@ -26,10 +26,13 @@ def format_size(size: int) -> str:
     >>> format_size(1500000)
     '1.50 MB'
     """
-    for unit, scale in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
-        if size >= scale:
-            return f"{size / scale:.2f} {unit}"
-    return f"{size} B"
+    unit, scale = unit_of(size)
+    return f"{size} B" if scale == 1 else f"{size / scale:.2f} {unit}"
+
+
+def unit_of(size: float) -> tuple[str, int]:
+    """The largest unit, a power of ten, that is not larger than a size; and its bytes."""
+    return next((each for each in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)) if size >= each[1]), ("bytes", 1))
 
 
 def format_mib(size: int) -> str:

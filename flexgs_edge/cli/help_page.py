@@ -123,8 +123,7 @@ class SectionCommand(click.Command):
 class ExpertCommand(SectionCommand):
     """A command with many options: `--help` shows the common ones, `--expert` shows all.
 
-    `usual`: names of the parameters that `--help` shows, in order. `more`: text that `--expert` shows below the
-    options.
+    `usual`: names of the parameters that `--help` shows, in order. `more`: text that `--expert` shows below the options.
     """
 
     def __init__(self, *args: Any, usual: Sequence[str], more: str, **kwargs: Any) -> None:

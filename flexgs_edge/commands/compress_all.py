@@ -212,13 +212,12 @@ def compress_all(
 ) -> BatchResult:
     """Compress several scenes into a folder; a scene that fails does not stop the others.
 
-    `inputs`: scene files, model folders, and folders of scenes. A folder that is no scene stands for the scenes
-    directly in it. `output`: the folder to write to, made if it is missing (None only in a dry run). Each file is named
-    after its scene, with the suffix replaced. Scenes of the same name keep their suffix too, then get the names of
-    their folders in front. `after`: called with the result so far after each scene, for those who want it even if the
-    run is interrupted. Returns the result of each scene, or its error. Errors of single scenes are logged, not raised.
-    Raises `InputError`: Before any work: if the folder cannot be written to, or an option does not fit several scenes
-    or the format.
+    `inputs`: scene files, model folders, and folders of scenes. A folder that is no scene stands for the scenes directly in it.
+    `output`: the folder to write to, made if it is missing (None only in a dry run). Each file is named after its scene, with
+    the suffix replaced. Scenes of the same name keep their suffix too, then get the names of their folders in front. `after`:
+    called with the result so far after each scene, for those who want it even if the run is interrupted. Returns the result of
+    each scene, or its error. Errors of single scenes are logged, not raised. Raises `InputError`: Before any work: if the
+    folder cannot be written to, or an option does not fit several scenes or the format.
     """
     options = replace(options or CompressOptions(), **words)
     suffix = output_suffix(format)

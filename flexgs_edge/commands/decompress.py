@@ -156,11 +156,8 @@ def _writing_bytes(source: SceneSource, format: Format | None) -> int:
     decoding = decode_bytes(source, None)
     if format is not None:
         return format.memory * source.count + decoding
-    return (
-        WRITE_COPIES * inria_dtype(source.sh_degree).itemsize * min(source.count, LEAST_ROWS)
-        + decoding
-        + decoding // SPARE_SHARE
-    )
+    row = WRITE_COPIES * inria_dtype(source.sh_degree).itemsize
+    return row * min(source.count, LEAST_ROWS) + decoding + decoding // SPARE_SHARE
 
 
 def _layers(input: ScenePlace, count: int, reading: Reading) -> tuple[tuple[int, ...], SceneSource | None]:

@@ -33,10 +33,9 @@ def evaluate(
 ) -> EvaluateResult:
     """Measure the quality that a scene lost against its original.
 
-    `against`: the original. Its cameras and photos are used if it has some beside it, else those beside `input`.
-    `options`: options as on the command line. Default: measure the held-out views; `holdout=0` measures all. `report`:
-    write a page about the run (index.html) and its record (result.json) to this folder. Returns quality of every view,
-    times and memory.
+    `against`: the original. Its cameras and photos are used if it has some beside it, else those beside `input`. `options`:
+    options as on the command line. Default: measure the held-out views; `holdout=0` measures all. `report`: write a page about
+    the run (index.html) and its record (result.json) to this folder. Returns quality of every view, times and memory.
     """
     options = replace(options or ViewOptions(), **words)
     if base_psnr is not None and not 0.0 < base_psnr < 200.0:

@@ -46,10 +46,9 @@ class Companions:
 def find_companions(path: str | os.PathLike[str]) -> Companions:
     """Find the cameras, photos and drawing settings that belong to a scene.
 
-    The search covers the folder of the file (`cameras.json`, `images/`), or the model folder: the given one, or the one
-    that holds the file as `point_cloud/iteration_*/*.ply`. `cfg_args` of a model folder names the background, and
-    photos in another place. It may also tell that the model is antialiased; the reference program leaves `antialiasing`
-    out.
+    The search covers the folder of the file (`cameras.json`, `images/`), or the model folder: the given one, or the one that
+    holds the file as `point_cloud/iteration_*/*.ply`. `cfg_args` of a model folder names the background, and photos in another
+    place. It may also tell that the model is antialiased; the reference program leaves `antialiasing` out.
 
     Raises `FormatError` if `cfg_args` cannot be understood.
     """

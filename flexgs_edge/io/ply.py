@@ -264,8 +264,7 @@ def _stamp(file: BinaryIO) -> tuple[int, int, int]:
 class _HeaderThenData:
     """The stream that plyfile reads: our own header (plyfile refuses UTF-8 comments), then the data, as text for ascii files.
 
-    A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be
-    checked.
+    A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be checked.
     """
 
     def __init__(self, header: PlyHeader, file: BinaryIO) -> None:

@@ -27,8 +27,7 @@ _SHOWN = 8  # Most names in a message
 _LIST_BYTES = 200  # Memory that plyfile takes for a list of a row, beside the values
 PROGRAM = "flexgs-edge"  # First word of our comments
 SMOOTHING = "filter_3D"
-"""Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not
-include."""
+"""Property of Mip-Splatting: standard deviation (scene units) of a filter that stored scales and opacities do not include."""
 
 
 @dataclass
@@ -125,8 +124,7 @@ class PlyHeader:
     def check_size(self, size: int) -> int:
         """Compare the claims of the header with the file's `size` in bytes (exactly for binary files without lists).
 
-        Returns bytes behind the data; 0 where lists or text leave them unknown. Raises `FormatError` if data are
-        missing.
+        Returns bytes behind the data; 0 where lists or text leave them unknown. Raises `FormatError` if data are missing.
         """
         for element in self.elements:
             if element.count and not element.properties:

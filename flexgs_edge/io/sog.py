@@ -78,9 +78,8 @@ def read_sog_folder(path: Path, name: str, reading: Reading) -> SogSource:
 def read_pieces(pieces: Pieces, meta_name: str, name: str, reading: Reading) -> SogSource:
     """Open a scene whose pieces are given.
 
-    `pieces`: gives the bytes of `meta.json` and of pictures. `meta_name`: name of the piece that names the others.
-    `name`: what messages call the scene. Raises `FormatError` if a piece is missing or damaged, or does not fit the
-    others.
+    `pieces`: gives the bytes of `meta.json` and of pictures. `meta_name`: name of the piece that names the others. `name`: what
+    messages call the scene. Raises `FormatError` if a piece is missing or damaged, or does not fit the others.
     """
     meta = parse_meta(pieces(meta_name), f"{name}: {META}")
     data = {key: pieces(piece) for key, piece in meta.files.items()}
@@ -112,8 +111,7 @@ def _pixels_of(data: bytes, count: int, place: str) -> int:
 class SogSource(DecodedSource):
     """A SOG scene, with the bytes of its pictures in memory.
 
-    `name`: what messages call it. `meta`: its checked description. `data`: the coded pictures, by the keys of
-    `SogMeta.files`.
+    `name`: what messages call it. `meta`: its checked description. `data`: the coded pictures, by the keys of `SogMeta.files`.
     """
 
     def __init__(self, name: str, meta: SogMeta, data: dict[str, bytes]) -> None:
@@ -304,7 +302,7 @@ def parse_meta(data: bytes, place: str) -> SogMeta:
         degree = sh.whole("bands", most=max(BANDS)) if "bands" in sh else None
         if degree != 0:
             palette = sh.whole("count", None, 1, 65536) if "count" in sh else None
-            table = _codebook(sh) if version == 2 else _ramp(sh)
+            table = _codebook(sh) if version == 2 else _steps(*(np.float64(sh.number(end)) for end in ("mins", "maxs")))
             files.update(zip(("centroids", "labels"), sh.names("files", 2)))
     return SogMeta(
         version=version,
@@ -336,11 +334,7 @@ def _ramps(part: JsonObject, width: int) -> np.ndarray:
     return _steps(part.numbers("mins", width)[:, None], part.numbers("maxs", width)[:, None])
 
 
-def _ramp(part: JsonObject) -> np.ndarray:
-    """[256] f64, equal steps between two numbers."""
-    return _steps(np.float64(part.number("mins")), np.float64(part.number("maxs")))
-
-
 def _steps(lowest: np.ndarray | np.float64, highest: np.ndarray | np.float64) -> np.ndarray:
+    """[..., 256] f64, equal steps between two numbers, or between those of each row."""
     shares = np.arange(LEVELS) / 255
     return np.asarray(lowest * (1 - shares) + highest * shares)

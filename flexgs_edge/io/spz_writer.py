@@ -28,9 +28,8 @@ from flexgs_edge.io.spz import (
 from flexgs_edge.scene.source import SceneSource
 
 SH_STEP, FINE_SH_STEP = 8, 2
-"""Steps of the SH codes, in units of 1/128; the reference program takes 16 above degree 1, which causes nearly all of its
-loss. The finer one is for SH that lie on a grid: elsewhere it costs more bytes than it is worth.
-docs/results/tuning.md#sh_step"""
+"""Steps of the SH codes, in units of 1/128; the reference program takes 16 above degree 1, which causes nearly all of its loss.
+The finer one is for SH that lie on a grid: elsewhere it costs more bytes than it is worth. docs/results/tuning.md#sh_step"""
 _FEW_BYTES = 1.25  # Most that the bytes of SH may grow by a finer step
 _TRIED_ROWS = 1 << 14
 _LEAST_BITS = 12  # Bits behind the point that other writers always take
@@ -67,9 +66,8 @@ def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
 def fraction_bits(source: SceneSource) -> int:
     """Bits behind the point of coordinates.
 
-    The step is at most 1/32 of the median size of the Gaussians, as the step of their log-scales is 1/16, and at most
-    that of 12 bits. A finer one costs bytes and shows nothing. The largest coordinate must fit, which may leave fewer
-    bits.
+    The step is at most 1/32 of the median size of the Gaussians, as the step of their log-scales is 1/16, and at most that of
+    12 bits. A finer one costs bytes and shows nothing. The largest coordinate must fit, which may leave fewer bits.
     """
     largest, sizes = 0.0, np.zeros(256, np.int64)
     for rows in source.chunks(_CHUNK_ROWS):

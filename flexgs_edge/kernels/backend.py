@@ -91,8 +91,7 @@ class Backend(Protocol):
     name: str
     is_numpy: bool
     threads: int
-    """Work-items that run side by side as threads of a processor with f64; 0 for a device without them, such as a
-    GPU."""
+    """Work-items that run side by side as threads of a processor with f64; 0 for a device without them, such as a GPU."""
     sort_blocks: int
     tile_blocks: int
     most_pairs: int

@@ -94,8 +94,7 @@ class DeviceInfo:
     form: str = ""  # Name of the form of the kernels that was measured to be fastest; empty if none was
     handle: cl.Device | None = field(default=None, repr=False, compare=False)
     context: cl.Context | None = field(default=None, repr=False, compare=False)
-    """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the
-    next."""
+    """The context of the self-test, kept alive: after the last context is gone, PoCL starts its compiler anew for the next."""
 
     @property
     def usable(self) -> bool:
@@ -222,10 +221,9 @@ def _first_line(text: str) -> str:
 def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
     """Choose the device that `spec` names; returns it with the reason.
 
-    `spec`: an index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first
-    GPU that passed the self-test, else PoCL's CPU device, else any other CPU device. Raises `DeviceError` if no device
-    matches, or the one that matches failed its self-test; the message lists all devices. We never take another device
-    than the one asked for.
+    `spec`: an index, `cpu`, `gpu`, or a part of the name of a device or platform. None, the default, takes the first GPU that
+    passed the self-test, else PoCL's CPU device, else any other CPU device. Raises `DeviceError` if no device matches, or the
+    one that matches failed its self-test; the message lists all devices. We never take another device than the one asked for.
     """
     listing = "; ".join(f"[{d.index}] {d.name} ({d.platform}, {d.type}): {d.self_test}" for d in devices)
     if not devices:

@@ -215,8 +215,7 @@ class OpenCLBackend:
     def kernel(self, source: str, name: str, options: tuple[str, ...], signature: str) -> cl.Kernel:
         """The kernel `name` of `source`, built with `options`; `signature` has one letter (u i f b) for each argument.
 
-        Raises `DeviceError` if the program does not build; the message has the device, the options and the compiler's
-        words.
+        Raises `DeviceError` if the program does not build; the message has the device, the options and the compiler's words.
         """
         try:
             program, seconds = built_program(self.context, source, options)

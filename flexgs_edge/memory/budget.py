@@ -1,9 +1,8 @@
 """One memory limit for the whole run, in bytes, and the planner that keeps it.
 
-The limit counts what the process already holds (Python, libraries, the OpenCL compiler) and every array and device
-buffer that a stage declares. A stage asks for `fixed` bytes plus `per_row` bytes. The planner answers with the rows
-that fit, or raises an error that names a sufficient limit: the smallest one for this stage, or one for the whole run where it
-is foreseen.
+The limit counts what the process already holds (Python, libraries, the OpenCL compiler) and every array and device buffer that
+a stage declares. A stage asks for `fixed` bytes plus `per_row` bytes. The planner answers with the rows that fit, or raises an
+error that names a sufficient limit: the smallest one for this stage, or one for the whole run where it is foreseen.
 """
 
 from __future__ import annotations

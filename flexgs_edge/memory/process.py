@@ -72,8 +72,7 @@ class AnonymousPeak:
 def available_memory(proc: str | Path = "/proc", groups: str | Path = "/sys/fs/cgroup") -> int:
     """Memory that this process can still get, in bytes; 1 GiB if the system does not tell.
 
-    A limit of a control group (a container, a service) counts too: beyond it the kernel kills the process, with no
-    error.
+    A limit of a control group (a container, a service) counts too: beyond it the kernel kills the process, with no error.
     """
     free = 2**30
     with suppress(OSError):

@@ -38,8 +38,7 @@ class Storage:
     """Allocates arrays in memory; the base of `ScratchStorage`."""
 
     spills = False
-    """Whether arrays lie in files. Then memory need hold only a few bytes for each row; the page cache takes what is
-    free."""
+    """Whether arrays lie in files. Then memory need hold only a few bytes for each row; the page cache takes what is free."""
     folder: Path | None = None
     whole_bytes = WHOLE_BYTES  # Bytes of the largest plane to hold as a whole; see `take_rows`
     peak = 0  # Most bytes that lay in files at one time

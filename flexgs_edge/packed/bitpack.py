@@ -1,8 +1,7 @@
 """Pack codes of 1 to 16 bits into bytes, least significant bit first: the code of row i starts at bit i * bits.
 
-Eight codes of b bits fill exactly b bytes, so every eighth row starts at a whole byte. We join eight codes in two
-64-bit words and keep the first b bytes. Any range of rows can be read without the rest.
-`BitSpec` says how many bits each attribute has.
+Eight codes of b bits fill exactly b bytes, so every eighth row starts at a whole byte. We join eight codes in two 64-bit words
+and keep the first b bytes. Any range of rows can be read without the rest. `BitSpec` says how many bits each attribute has.
 """
 
 from __future__ import annotations

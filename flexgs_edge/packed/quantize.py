@@ -151,10 +151,9 @@ def quantize_scene(
 ) -> QuantizedScene:
     """Quantize the chosen rows of a scene; the result does not depend on `chunk_rows`.
 
-    `rows_with_sh`, `rows_without_sh`: [n] i64 ascending, from `select_rows`, stored in this order. At SH degree 0, no
-    row counts as one with SH. `groups`: groups per channel of every array; by default about one for 512 rows. 1 is
-    plain round to nearest. `contraction`: from `far_contraction`. Rows are then stored by distance, so that few groups
-    hold near and far ones.
+    `rows_with_sh`, `rows_without_sh`: [n] i64 ascending, from `select_rows`, stored in this order. At SH degree 0, no row
+    counts as one with SH. `groups`: groups per channel of every array; by default about one for 512 rows. 1 is plain round to
+    nearest. `contraction`: from `far_contraction`. Rows are then stored by distance, so that few groups hold near and far ones.
     """
     if source.sh_degree == 0 and len(rows_with_sh):
         rows_without_sh = np.sort(np.concatenate([rows_with_sh, rows_without_sh]))

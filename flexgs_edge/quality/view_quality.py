@@ -31,11 +31,10 @@ Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | N
 class ViewQuality:
     """Quality of one view. PSNRs are in dB, and `None` if images are identical or one of them is missing.
 
-    `photo_error`, `original_error`: mean squared error of this render, and of the original's render, against the photo;
-    `None` without a photo. `ssim_original`, `ssim_photo`, `original_ssim`: SSIM against the original's render, against
-    the photo, and of the original against the photo. `lpips_original`, `lpips_photo`, `original_lpips`: LPIPS of the
-    same three pairs; `None` unless it was asked for. `flip_original`, `flip_photo`, `original_flip`: FLIP of the same
-    three pairs, mean over the pixels.
+    `photo_error`, `original_error`: mean squared error of this render, and of the original's render, against the photo; `None`
+    without a photo. `ssim_original`, `ssim_photo`, `original_ssim`: SSIM against the original's render, against the photo, and
+    of the original against the photo. `lpips_original`, `lpips_photo`, `original_lpips`: LPIPS of the same three pairs; `None`
+    unless it was asked for. `flip_original`, `flip_photo`, `original_flip`: FLIP of the same three pairs, mean over the pixels.
     """
 
     name: str  # name of the view

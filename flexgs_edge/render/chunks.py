@@ -19,8 +19,7 @@ from flexgs_edge.scene.source import SceneSource
 SIGMAS = math.sqrt((LOG2_255 + EXTENT_SLACK) * 2.0 * math.log(2.0))
 """Standard deviations that the ellipse of an opaque splat reaches."""
 ROUNDING = 1e-5
-"""Bound of the float32 error in `project`, as a share of the largest term: generous, so that no block vanishes by
-rounding."""
+"""Bound of the float32 error in `project`, as a share of the largest term: generous, so that no block vanishes by rounding."""
 LARGER = 1.001  # Factor that widens the extent of a block against rounding
 
 
@@ -28,8 +27,7 @@ LARGER = 1.001  # Factor that widens the extent of a block against rounding
 class ChunkBounds:
     """Bounds of the blocks of one chunk of a scene: ROW_BLOCK rows each, in row order.
 
-    `middle`, `half`: [3, blocks] f64, centre and half size of the box around the means, scene units relative to the
-    origin.
+    `middle`, `half`: [3, blocks] f64, centre and half size of the box around the means, scene units relative to the origin.
     """
 
     middle: np.ndarray

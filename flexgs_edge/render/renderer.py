@@ -42,10 +42,9 @@ class _View:
 class Renderer(AbstractContextManager["Renderer"]):
     """Renders views and sums what each Gaussian contributes, on a backend.
 
-    `antialiased`: multiply opacities by sqrt(det before / det
-    after) of the 2D covariance's dilation. Set it if the model was trained so. `storage`: takes the sums over views if
-    memory cannot hold them beside a view. `largest`: the largest view to come, if it is known. Its size decides whether
-    views have room for all rows.
+    `antialiased`: multiply opacities by sqrt(det before / det after) of the 2D covariance's dilation. Set it if the model was
+    trained so. `storage`: takes the sums over views if memory cannot hold them beside a view. `largest`: the largest view to
+    come, if it is known. Its size decides whether views have room for all rows.
     """
 
     def __init__(
@@ -194,8 +193,7 @@ class Renderer(AbstractContextManager["Renderer"]):
     def residual_and_removal_sums(self, scene: DeviceScene, camera: Camera, target: np.ndarray) -> Any:
         """The sums of `residual_sums` and `removal_sums` in one view, cheaper than two calls.
 
-        Returns [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are
-        drawn.
+        Returns [m, 6, 2] u32: the sums of `residual_sums`, then those of `removal_sums`; valid until the next sums are drawn.
         """
         return self._sums(scene, camera, 6, "blend_both", target)
 

@@ -39,26 +39,19 @@ class ConversionLoss:
         if self.values:
             median, most = self.values["position_by_size"]
             opacity, colour = self.values["opacity"][1], self.values["colour"][1]
-            lines.append(
-                line(
-                    "values",
-                    f"positions move by {100 * median:.2g} % of a splat's size in the median, {100 * most:.2g} % at most; "
-                    f"opacities by up to {opacity:.2g}, colours by {colour:.2g}",
-                )
+            moved = (
+                f"positions move by {100 * median:.2g} % of a splat's size in the median, {100 * most:.2g} % at most"
             )
+            lines.append(line("values", f"{moved}; opacities by up to {opacity:.2g}, colours by {colour:.2g}"))
         if not self.views:
             return [*lines, line("pictures", f"not compared: {self.why}")]
-        same = (
-            "the same pictures"
-            if self.fidelity is None
-            else f"fidelity {self.fidelity:.2f} dB, worst {self.worst:.2f} dB"
-        )
-        lost = (
-            f"; drop {self.drop:.3f} dB against the photos"
-            if self.base_psnr is None
-            else f"; modelled drop {self.drop:.3f} dB from a base of {self.base_psnr:g} dB"
-        )
-        return [*lines, line("pictures", f"{same}{lost} ({self.views} views, cameras from {self.cameras})")]
+        same = "the same pictures"
+        if self.fidelity is not None:
+            same = f"fidelity {self.fidelity:.2f} dB, worst {self.worst:.2f} dB"
+        lost = f"drop {self.drop:.3f} dB against the photos"
+        if self.base_psnr is not None:
+            lost = f"modelled drop {self.drop:.3f} dB from a base of {self.base_psnr:g} dB"
+        return [*lines, line("pictures", f"{same}; {lost} ({self.views} views, cameras from {self.cameras})")]
 
 
 @dataclass(frozen=True)
@@ -81,9 +74,8 @@ class DecompressResult(Result):
         lines = scene_lines("scene", self.scene)
         lines.append(line("wrote", f"{self.output}, {self.size} bytes ({format_size(self.size)})"))
         if self.scene.bytes is not None:
-            change = (
-                "as large as" if self.size == self.scene.bytes else f"{times_words(self.scene.bytes / self.size)} than"
-            )
+            times = f"{times_words(self.scene.bytes / self.size)} than"
+            change = "as large as" if self.size == self.scene.bytes else times
             lines.append(line("size", f"{change} the input's {format_size(self.scene.bytes)}"))
         lines += [] if self.loss is None else self.loss.lines()
         lines += [line("note", note) for note in self.notes]
@@ -127,13 +119,9 @@ class RenderResult(Result):
         last = f" ... {self.files[-1]}" if len(self.files) > 1 else ""
         many = f"{len(self.files)} PNG files: " if len(self.files) != 1 else ""
         lines.append(line("wrote", f"{many}{first}{last}"))
-        lines.append(
-            line(
-                "time",
-                f"{self.ms_per_view:.1f} ms a view (median); start-up {1000 * self.run.startup_seconds:.0f} ms and "
-                f"kernel compilation {1000 * self.run.compile_seconds:.0f} ms apart",
-            )
-        )
+        start = f"start-up {1000 * self.run.startup_seconds:.0f} ms"
+        build = f"kernel compilation {1000 * self.run.compile_seconds:.0f} ms"
+        lines.append(line("time", f"{self.ms_per_view:.1f} ms a view (median); {start} and {build} apart"))
         return text([*lines, *run_lines(self.run)])
 
 

@@ -16,7 +16,7 @@ from flexgs_edge.report.html import count, figure, render
 from flexgs_edge.report.results import CompressResult, EvaluateResult, decided_words
 from flexgs_edge.report.run_info import RunInfo, SceneInfo
 from flexgs_edge.report.summary import device_words, memory_words
-from flexgs_edge.units import format_size, times_words
+from flexgs_edge.units import format_size, times_words, unit_of
 
 # As wide as a phone, so that text stays readable there. On larger screens the chart and its text grow together.
 WIDTH, HEIGHT = 360, 230
@@ -126,7 +126,7 @@ def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
     limit = getattr(target, "limit", None) if target.limit_bytes is None else None
     low_x, high_x, ticks_x = nice_range([p[0] for p in points] + ([target.limit_bytes] if target.limit_bytes else []))
     low_y, high_y, ticks_y = nice_range([p[1] for p in points] + ([limit] if limit is not None else []))
-    unit, word = _unit(high_x)
+    word, unit = unit_of(high_x)
 
     def x(value: float) -> float:
         return _LEFT + (value - low_x) / (high_x - low_x) * (_RIGHT - _LEFT)
@@ -152,13 +152,6 @@ def step_chart(steps: Sequence[Step], chosen: Step, target: Target) -> str:
         limit_y=None if limit is None else y(limit),
         marks=[(x(size), y(at), step) for size, at, step in points],
     )
-
-
-def _unit(most: float) -> tuple[int, str]:
-    for scale, word in ((10**9, "GB"), (10**6, "MB"), (10**3, "kB")):
-        if most >= scale:
-            return scale, word
-    return 1, "bytes"
 
 
 def nice_range(values: Sequence[float], most: int = 5) -> tuple[float, float, list[float]]:

@@ -118,9 +118,8 @@ class CompressResult(Result):
         share = f"{self.count} of {self.scene.count} Gaussians, {self.sh_count} of them with SH"
         lines.append(line("kept", f"{share} (prune rate {self.prune_rate:g}, SH rate {self.sh_rate:g})"))
         if self.format != "fgs":
-            lines.append(
-                line("format", f".{self.format}, SH degree {self.file_sh_degree}, rounded as that format does")
-            )
+            degree = f"SH degree {self.file_sh_degree}"
+            lines.append(line("format", f".{self.format}, {degree}, rounded as that format does"))
         elif self.steps is not None:
             steps = (f"{name} {value:.3g}" for name, value in self.steps.items() if isinstance(value, float))
             lines.append(line("grid steps", ", ".join(steps)))
@@ -133,9 +132,8 @@ class CompressResult(Result):
             lines += quality_lines(self.quality, f"{decoded}, {len(self.quality.views)} {self.quality_views} views")
         lines += [line("warning", words) for words in self.warnings]
         if self.score_cache:
-            lines.append(
-                line("scores", f"{'reused from' if self.scores_reused else 'made anew, kept in'} {self.score_cache}")
-            )
+            made = "reused from" if self.scores_reused else "made anew, kept in"
+            lines.append(line("scores", f"{made} {self.score_cache}"))
         return text([*lines, *run_lines(self.run)])
 
 

@@ -132,7 +132,6 @@ class RemovedGroup:
     def __str__(self) -> str:
         place = ", ".join(f"{value:.4g}" for value in self.centre)
         verdict = "" if self.removed else ", so they stay"
-        change = (
-            "no view changes" if self.gain == 0 else f"{'gain' if self.gain > 0 else 'loss'} {abs(self.gain):.4f} dB"
-        )
+        loss = f"{'gain' if self.gain > 0 else 'loss'} {abs(self.gain):.4f} dB"
+        change = "no view changes" if self.gain == 0 else loss
         return f"{self.count} {self.kind} (around {place}): {change}{verdict}"

@@ -50,13 +50,8 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
             for name in SIMILARITIES
             if (found := getattr(quality, f"{name}_photo")) is not None
         )
-        lines.append(
-            line(
-                "drop",
-                f"{decibel(quality.drop)} dB against the photos: PSNR {decibel(quality.original_psnr)} -> "
-                f"{decibel(quality.psnr)} dB{also} (mean, {where})",
-            )
-        )
+        psnr = f"PSNR {decibel(quality.original_psnr)} -> {decibel(quality.psnr)} dB"
+        lines.append(line("drop", f"{decibel(quality.drop)} dB against the photos: {psnr}{also} (mean, {where})"))
         lines += _photo_lines(quality)
     identical = f", {quality.identical} views identical" if quality.identical and quality.fidelity is not None else ""
     unit = "" if quality.fidelity is None else " dB"
@@ -65,14 +60,14 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
         for name in SIMILARITIES
         if (found := getattr(quality, f"{name}_original")) is not None
     )
-    lines.append(
-        line(
-            "fidelity",
-            f"{decibel(quality.fidelity)}{unit} against the original's renders{identical}{also}; modelled drop "
-            f"{quality.modelled_drop:.3f} dB if the photos are {quality.base_psnr:g} dB from the original (mean, {where})",
-        )
+    modelled = (
+        f"{quality.modelled_drop:.3f} dB if the photos are {quality.base_psnr:g} dB from the original (mean, {where})"
     )
-    lines.append(line("covered", covered_words(quality)))
+    against = f"{decibel(quality.fidelity)}{unit} against the original's renders{identical}{also}"
+    lines.append(line("fidelity", f"{against}; modelled drop {modelled}"))
+    fidelity = decibel(quality.covered_fidelity) + ("" if quality.covered_fidelity is None else " dB")
+    where = f"over the part of the pictures that the original covers ({100 * quality.coverage:.3g} %)"
+    lines.append(line("covered", f"fidelity {fidelity}, modelled drop {quality.covered_modelled_drop:.3f} dB {where}"))
     worst = quality.worst
     if worst is not None:
         kind = "drop" if worst.far_base is None else "modelled drop"
@@ -90,36 +85,21 @@ def _photo_lines(quality: Quality) -> list[str]:
     lines, total = [], len(quality.views)
     stops = [stop for view in quality.views for stop in view.exposure or ()]
     if stops:
-        lines.append(
-            line(
-                "exposure",
-                f"{len(stops) // 3} of {total} photos were brought to the exposure of the original ({min(stops):+.2f} to "
-                f"{max(stops):+.2f} stops); --exposure none compares them as they are",
-            )
-        )
+        done = f"{len(stops) // 3} of {total} photos were brought to the exposure of the original"
+        by = f"({min(stops):+.2f} to {max(stops):+.2f} stops)"
+        lines.append(line("exposure", f"{done} {by}; --exposure none compares them as they are"))
     far = [view for view in quality.views if view.far_base is not None]
     counted = quality.usual_drop or 0.0
     if far:
         shown = ", ".join(view.name for view in far[:FAR_SHOWN]) + (", ..." if len(far) > FAR_SHOWN else "")
-        lines.append(
-            line(
-                "counted",
-                f"{counted:.3f} dB. The original is far from its photo in {len(far)} of {total} views ({shown}), where a photo "
-                f"shows no loss, so these count by their modelled drop from {far[0].far_base:.1f} dB",
-            )
+        where = (
+            f"The original is far from its photo in {len(far)} of {total} views ({shown}), where a photo shows no loss"
         )
+        base = f"their modelled drop from {far[0].far_base:.1f} dB"
+        lines.append(line("counted", f"{counted:.3f} dB. {where}, so these count by {base}"))
     elif quality.drop is not None and counted - quality.drop >= 0.001:
         lines.append(line("counted", f"{counted:.3f} dB: a view that gains counts as 0"))
     return lines
-
-
-def covered_words(quality: Quality) -> str:
-    """Describe the figures over the part of the pictures that the original covers."""
-    unit = "" if quality.covered_fidelity is None else " dB"
-    return (
-        f"fidelity {decibel(quality.covered_fidelity)}{unit}, modelled drop {quality.covered_modelled_drop:.3f} dB over the "
-        f"part of the pictures that the original covers ({100 * quality.coverage:.3g} %)"
-    )
 
 
 def run_lines(run: RunInfo) -> list[str]:

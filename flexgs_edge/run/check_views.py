@@ -91,7 +91,11 @@ def _find_fault(run: Run[Options], renderer: Renderer, views: ViewSet) -> tuple[
             bad = [indices[i] for i, value in enumerate(likenesses) if value < ALIKE]
             shift = _shift_of_neighbours(compared)
             if 2 * len(bad) <= len(known) and shift is None and not _masks(compared):
-                return (_some_bad(views, bad, len(known)), False) if bad else None
+                words = (
+                    f"{len(bad)} of {len(known)} compared views do not resemble their photo ({_names(views, bad)}). What they "
+                    "lose says little. Are these photos of this scene, and sharp?"
+                )
+                return (words, False) if bad else None
             cause = _cause(run.scene.frame, renderer, scene, views, compared, shift)
             return f"{_misfit(compared, len(bad), len(known))} {cause}", True
     finally:
@@ -153,24 +157,15 @@ def _names(views: ViewSet, indices: Sequence[int], most: int = 3) -> str:
     return ", ".join(views.cameras[i].name for i in indices[:most]) + more
 
 
-def _some_bad(views: ViewSet, bad: list[int], known: int) -> str:
-    return (
-        f"{len(bad)} of {known} compared views do not resemble their photo ({_names(views, bad)}). What they lose says little. "
-        "Are these photos of this scene, and sharp?"
-    )
-
-
 def _misfit(compared: _Compared, bad: int, known: int) -> str:
     errors = [mse(a, b) for a, b in zip(compared.renders, compared.photos, strict=True)]
     half = len(compared.photos) // 2
     others = compared.photos[half:] + compared.photos[:half]
     turned = [mse(a, b) for a, b in zip(compared.renders, others) if a.shape == b.shape]
     own, other = psnr(float(np.median(errors))), psnr(float(np.median(turned))) if turned else None
-    against = (
-        ""
-        if own is None or other is None
-        else f" (PSNR of the original {own:.1f} dB, with other photos {other:.1f} dB)"
-    )
+    against = ""
+    if own is not None and other is not None:
+        against = f" (PSNR of the original {own:.1f} dB, with other photos {other:.1f} dB)"
     if _masks(compared):
         return f"the photos have no colours{against}."
     if 2 * bad <= known:

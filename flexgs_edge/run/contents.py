@@ -53,7 +53,7 @@ def _packed_info(path: Path, header: Header) -> InfoResult:
 def _grid_info(path: Path) -> InfoResult:
     """Contents of a version 2 file. The bytes of each channel come from the header, else from decoding the file."""
     container = GridContainer(path)
-    header = container.header
+    header, length = container.header, container.header.preview.length
     known = header.channels or _decoded_channels(path, header)
     layers = [{"rows": rows, "bytes": 0} for rows in header.layers]
     for chunk, entry in zip(header.chunks(), container.read_table(), strict=True):
@@ -74,15 +74,9 @@ def _grid_info(path: Path) -> InfoResult:
         chroma=header.steps["chroma"],
         model_bytes=header.model.length,
         layers=tuple(layers),
-        preview=_preview(container),
+        preview={"rows": Preview(container).header.count, "bytes": length} if length else None,
         cut_from=header.cut_from,
     )
-
-
-def _preview(container: GridContainer) -> dict[str, int] | None:
-    if not container.header.preview.length:
-        return None
-    return {"rows": Preview(container).header.count, "bytes": container.header.preview.length}
 
 
 def _decoded_channels(path: Path, header: GridHeader) -> Channels:

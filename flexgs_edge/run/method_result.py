@@ -47,8 +47,7 @@ def make_settings(
 
     Every run and machine must store the same settings, so they hold no times, paths or devices.
 
-    `run`: gives the options, the plan and the scene. `search`: `None` for fixed rates. `bits`: bits per attribute
-    (`paper`).
+    `run`: gives the options, the plan and the scene. `search`: `None` for fixed rates. `bits`: bits per attribute (`paper`).
     """
     options, plan, scene, views = run.options, run.plan, run.scene, run.views
     choice = search.chosen.choice if search else options.fixed

@@ -155,10 +155,9 @@ def unpacked(
 ) -> SceneSource:
     """Unpack a file into the folder that TMPDIR names, and open it there.
 
-    `path`: the packed file. `name`: the user's path, for messages. `open_file`: opens the unpacked file. `least_free`:
-    bytes of the temporary disk that must stay free. Raises `InputError` if the file cannot be read. Raises
-    `FormatError` if it is no whole gzip file, or unpacks to far more than a scene would. Raises `BudgetError` if the
-    temporary disk has no room for it.
+    `path`: the packed file. `name`: the user's path, for messages. `open_file`: opens the unpacked file. `least_free`: bytes of
+    the temporary disk that must stay free. Raises `InputError` if the file cannot be read. Raises `FormatError` if it is no
+    whole gzip file, or unpacks to far more than a scene would. Raises `BudgetError` if the temporary disk has no room for it.
     """
     check_readable(path, name)
     folder = tempfile.TemporaryDirectory(prefix="flexgs-")

@@ -193,9 +193,8 @@ def open_run(
 ) -> Run[Options]:
     """Open a scene with its views (stage `open`).
 
-    `judged_path`: a scene made from this one, which it is compared with. Both are drawn as its file says, and cameras
-    beside it are used where this one has none. Raises `InputError` when the scene, its cameras or its photos cannot be
-    used.
+    `judged_path`: a scene made from this one, which it is compared with. Both are drawn as its file says, and cameras beside it
+    are used where this one has none. Raises `InputError` when the scene, its cameras or its photos cannot be used.
     """
     clock = Stopwatch()
     budget = MemoryBudget.from_limit(options.memory_limit)

@@ -235,9 +235,8 @@ def contrasting_background(source: SceneSource, usual: Colour) -> tuple[Colour, 
     if hidden <= MOST_SHARE:
         return usual, None
     name = next((name for name, each in BACKGROUNDS.items() if share(each) <= MOST_SHARE), "green")
-    return BACKGROUNDS[
-        name
-    ], f"compared before {name}: {100 * hidden:.0f} % of the matter has the colour of the background"
+    why = f"{100 * hidden:.0f} % of the matter has the colour of the background"
+    return BACKGROUNDS[name], f"compared before {name}: {why}"
 
 
 @contextmanager

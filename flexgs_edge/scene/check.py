@@ -15,8 +15,7 @@ from flexgs_edge.scene.source import Planes, SceneSource, SelectSource, WrappedS
 TELLING_ROWS = 32  # In scenes of fewer Gaussians, all opacities and scales may look activated by chance
 _TINY = np.finfo(np.float32).tiny
 SH_LARGEST = 1e15
-"""Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is
-NaN."""
+"""Larger SH coefficients are invalid: squares of their colours leave float32, and infinity times a weight of zero is NaN."""
 MOST_ALIKE = math.ceil(math.log(TRANSMITTANCE_MIN) / math.log1p(-ALPHA_MIN)) + 1
 """So many splats of one shape and place end every pixel that they reach, and one more for rounding. Later ones never show."""
 SHAPE = "means", "log_scales", "quats", "opacity_logits"  # Fields that decide where a splat is how opaque

@@ -24,8 +24,7 @@ Planes = dict[str, np.ndarray]  # Arrays by field name, each [width, n] f32
 Rows = slice | np.ndarray  # `slice(start, stop)`, or a sorted int64 array
 
 _TURN_ROWS = 1024
-"""Rows transposed at a time: 250 kB at SH degree 3. The columns of a whole chunk would not stay in the processor's
-cache."""
+"""Rows transposed at a time: 250 kB at SH degree 3. The columns of a whole chunk would not stay in the processor's cache."""
 
 REST_WIDTHS: dict[int, int] = {3 * sh_rest_count(degree): degree for degree in range(MAX_SH_DEGREE + 1)}
 """SH degree by the number of `sh_rest` channels: 0, 9, 24, 45, 72."""

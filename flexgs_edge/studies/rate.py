@@ -21,19 +21,7 @@ from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.inputs import load_scene
 from flexgs_edge.run.options import NO_CAMERAS, CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
-from flexgs_edge.studies.written import (
-    FIGURES,
-    Cell,
-    Experiment,
-    Row,
-    SceneStudy,
-    Study,
-    Table,
-    columns,
-    figures,
-    number,
-    write_study,
-)
+from flexgs_edge.studies import written
 
 RATIOS = (8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PEERS = (".spz", ".sog", ".compressed.ply")  # Formats of other programs that the study compares with
@@ -50,7 +38,7 @@ HEADS = {
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",
     "flip": "FLIP",
-    **FIGURES,
+    **written.FIGURES,
     "seconds": "seconds",
 }
 _INTRO = (
@@ -67,7 +55,7 @@ def study_rate(
     progress: Progress = SILENT,
     ratios: Sequence[float] = RATIOS,
     **words: Any,
-) -> Study:
+) -> written.Study:
     """Measure bytes and quality of every method on a scene and write them to a folder.
 
     `ratios`: PLY bytes over file bytes.
@@ -79,7 +67,7 @@ def study_rate(
     if not ratios:
         raise InputError("--ratios: expected one ratio or more, such as 8,16,32")
     points = _Points(scene, options, progress)
-    return write_study(
+    return written.write_study(
         "study rate",
         output,
         options.force,
@@ -100,10 +88,10 @@ class _Points:
     def __post_init__(self) -> None:
         # Methods are compared by the mean alone, each at the size that it is given.
         self.options = replace(self.options, promise="mean", dry_run=True, report=None)
-        self.rows: list[dict[str, Cell]] = []
+        self.rows: list[dict[str, written.Cell]] = []
         self.missing: list[str] = []
 
-    def study(self, ratios: Sequence[float], folder: Path) -> SceneStudy:
+    def study(self, ratios: Sequence[float], folder: Path) -> written.SceneStudy:
         """Make all files, and compare them."""
         unpruned = self._compress("paper", None, prune_rate=0.0, sh_rate=0.0)
         for ratio in ratios:
@@ -116,11 +104,11 @@ class _Points:
             self._convert(folder / f"scene{suffix}", unpruned)
         order = ("best", "paper")
         self.rows.sort(key=lambda row: order.index(str(row["method"])) if row["method"] in order else len(order))
-        table = Table(columns(**HEADS), tuple(self.rows))
+        table = written.Table(written.columns(**HEADS), tuple(self.rows))
         made = [_rate(table, self.missing, self.options.effort)]
         if table.rows[-1]["drop"] is not None:
             made.append(_fidelity(table))
-        return SceneStudy.of(self.scene, unpruned, *made)
+        return written.SceneStudy.of(self.scene, unpruned, *made)
 
     def _compress(self, method: str, ratio: float | None, **words: Any) -> CompressResult:
         options = replace(self.options, method=method, min_ratio=ratio, **words)
@@ -162,7 +150,7 @@ class _Points:
                 "psnr": rounded(quality.psnr),
                 "ssim": rounded(ssim, 5),
                 "flip": rounded(flip, 5),
-                **figures(size, ply_bytes, measurement_of(quality)),
+                **written.figures(size, ply_bytes, measurement_of(quality)),
                 "seconds": round(seconds, 2),
             }
         )
@@ -189,7 +177,7 @@ class Curve:
         return float(np.exp(np.interp(-place, -self._losses[ends], self._sizes[ends])))
 
 
-def _rate(table: Table, missing: Sequence[str], effort: str) -> Experiment:
+def _rate(table: written.Table, missing: Sequence[str], effort: str) -> written.Experiment:
     """Compare all methods by bytes and the deciding figure."""
     with_photos = table.rows[-1]["drop"] is not None
     against = "PSNR, SSIM and FLIP are against the photos"
@@ -198,7 +186,7 @@ def _rate(table: Table, missing: Sequence[str], effort: str) -> Experiment:
     findings = list(_comparisons(table.rows, "drop" if with_photos else "modelled_drop"))
     if missing:
         findings.append(f"Left out or not reached: {'; '.join(missing)}.")
-    return Experiment(
+    return written.Experiment(
         "rate",
         "Bytes and quality",
         f"Every method at the sizes asked for: best at the effort {effort}, paper with its rates to choose, and the whole scene "
@@ -210,15 +198,15 @@ def _rate(table: Table, missing: Sequence[str], effort: str) -> Experiment:
     )
 
 
-def _fidelity(table: Table) -> Experiment:
+def _fidelity(table: written.Table) -> written.Experiment:
     """Compare all methods by bytes and fidelity to the original's renders, for scenes that photos decide."""
     names = ("method", "wanted_ratio", "size", "ratio", "fidelity")
-    own = Table(
-        columns(**{name: HEADS[name] for name in names}),
+    own = written.Table(
+        written.columns(**{name: HEADS[name] for name in names}),
         tuple({name: row[name] for name in names} for row in table.rows),
     )
     best = [row for row in own.rows if row["method"] == "best"]
-    return Experiment(
+    return written.Experiment(
         "fidelity",
         "Bytes and fidelity",
         f"The same files; {FIDELITY_WORDS}, which shows all errors. A drop against photos hides those that come nearer to one.",
@@ -228,7 +216,7 @@ def _fidelity(table: Table) -> Experiment:
     )
 
 
-def _chart(table: Table, title: str, figure: str) -> LineChart:
+def _chart(table: written.Table, title: str, figure: str) -> LineChart:
     series = []
     for method in dict.fromkeys(str(row["method"]) for row in table.rows):
         sizes = [size / 1e6 for size in table.values("size", method=method)]
@@ -238,27 +226,28 @@ def _chart(table: Table, title: str, figure: str) -> LineChart:
     floating = figure == "fidelity"
     words = "bytes of the file, MB (log)"
     return LineChart(
-        title, words, FIGURES[figure], tuple(series), log_x=True, floating=floating, magnitudes=not floating
+        title, words, written.FIGURES[figure], tuple(series), log_x=True, floating=floating, magnitudes=not floating
     )
 
 
-def _comparisons(rows: Sequence[Row], figure: str) -> Iterator[str]:
+def _comparisons(rows: Sequence[written.Row], figure: str) -> Iterator[str]:
     """Sentences that compare best with each other method, at equal loss."""
-    word = FIGURES[figure].removesuffix(" (dB)")
+    word = written.FIGURES[figure].removesuffix(" (dB)")
     best = [row for row in rows if row["method"] == "best"]
     paper = {row["wanted_ratio"]: row for row in rows if row["method"] == "paper" and row["wanted_ratio"] is not None}
     pairs = [(row, paper[row["wanted_ratio"]]) for row in best if row["wanted_ratio"] in paper]
     if pairs:
         words = ", ".join(
-            f"{a['wanted_ratio']:g}x: {number(a, figure):.2f} / {number(b, figure):.2f} dB" for a, b in pairs
+            f"{a['wanted_ratio']:g}x: {written.number(a, figure):.2f} / {written.number(b, figure):.2f} dB"
+            for a, b in pairs
         )
         yield f"{word.capitalize()} of best / paper at equal ratios: {words}."
-    curve = Curve((number(row, "size"), number(row, figure)) for row in best)
+    curve = Curve((written.number(row, "size"), written.number(row, figure)) for row in best)
 
-    def share(row: Row) -> float | None:
+    def share(row: written.Row) -> float | None:
         """Bytes on the curve of best at the row's loss, divided by the row's bytes."""
-        size = curve.size(number(row, figure))
-        return None if size is None else size / number(row, "size")
+        size = curve.size(written.number(row, figure))
+        return None if size is None else size / written.number(row, "size")
 
     shares = [part for part in map(share, paper.values()) if part is not None]
     if shares:
@@ -270,4 +259,4 @@ def _comparisons(rows: Sequence[Row], figure: str) -> Iterator[str]:
         if row["method"] not in ("best", "paper"):
             part = share(row)
             than = "beyond the ends of best's curve" if part is None else f"best needs {part:.0%} of its bytes there"
-            yield f"{row['method']}: {row['ratio']:.1f}x at {number(row, figure):.3f} dB of {word}; {than}."
+            yield f"{row['method']}: {row['ratio']:.1f}x at {written.number(row, figure):.3f} dB of {word}; {than}."

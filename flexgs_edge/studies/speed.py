@@ -11,18 +11,7 @@ from flexgs_edge.report.plots import LineChart, Series
 from flexgs_edge.report.results import CompressResult
 from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
-from flexgs_edge.studies.written import (
-    FIGURES,
-    Cell,
-    Experiment,
-    SceneStudy,
-    Study,
-    Table,
-    columns,
-    figures,
-    number,
-    write_study,
-)
+from flexgs_edge.studies import written
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
 
@@ -33,10 +22,10 @@ def study_speed(
     options: CompressOptions | None = None,
     progress: Progress = SILENT,
     **words: Any,
-) -> Study:
+) -> written.Study:
     """Measure the time and the ratio of every preset on a scene and write them to a folder."""
     options = replace(options or CompressOptions(), **words)
-    return write_study(
+    return written.write_study(
         "study speed",
         output,
         options.force,
@@ -52,32 +41,32 @@ _INTRO = (
 )
 
 
-def _study(path: str | Path, options: CompressOptions, progress: Progress) -> SceneStudy:
+def _study(path: str | Path, options: CompressOptions, progress: Progress) -> written.SceneStudy:
     """One dry run of `compress` for each preset, all with the same target."""
-    rows: list[dict[str, Cell]] = []
+    rows: list[dict[str, written.Cell]] = []
     for method, effort in PRESETS:
         LOG.info("compress --method %s --effort %s", method, effort)
         words = replace(options, method=method, effort=effort, dry_run=True, best_effort=True, report=None)
         found = compress(path, None, words, progress)
         rows.append(_row(method, effort, found))
-    best = front([number(row, "seconds") for row in rows], [number(row, "ratio") for row in rows])
+    best = front([written.number(row, "seconds") for row in rows], [written.number(row, "ratio") for row in rows])
     for row, on in zip(rows, best):
         row["front"] = on
-    table = Table(
-        columns(
+    table = written.Table(
+        written.columns(
             method="method",
             effort="effort",
             seconds="seconds",
             search_seconds="of them, search",
             steps="results measured",
-            **FIGURES,
+            **written.FIGURES,
             kept="Gaussians kept",
             reached="target met",
             front="on the front",
         ),
         tuple(rows),
     )
-    experiment = Experiment(
+    experiment = written.Experiment(
         "presets",
         "Time of a whole run and the ratio that it finds",
         f"compress by each method and effort, asked for {found.target}: opening, scoring, searching, coding and measuring the "
@@ -97,7 +86,7 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
                 for method in dict.fromkeys(str(row["method"]) for row in rows)
             ),
             log_x=True,
-            front=[(number(row, "seconds"), number(row, "ratio")) for row in rows if row["front"]],
+            front=[(written.number(row, "seconds"), written.number(row, "ratio")) for row in rows if row["front"]],
         ),
         (
             "; ".join(
@@ -108,10 +97,10 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> Sc
         ),
         timed=True,
     )
-    return SceneStudy.of(path, found, experiment)
+    return written.SceneStudy.of(path, found, experiment)
 
 
-def _row(method: str, effort: str, found: CompressResult) -> dict[str, Cell]:
+def _row(method: str, effort: str, found: CompressResult) -> dict[str, written.Cell]:
     assert found.quality is not None
     return {
         "method": method,
@@ -119,13 +108,13 @@ def _row(method: str, effort: str, found: CompressResult) -> dict[str, Cell]:
         "seconds": round(found.run.seconds - found.run.startup_seconds, 2),
         "search_seconds": round(found.run.stages.get("search", 0.0), 2),
         "steps": 0 if found.search is None else len(found.search.steps),
-        **figures(found.size, found.scene.ply_bytes, measurement_of(found.quality)),
+        **written.figures(found.size, found.scene.ply_bytes, measurement_of(found.quality)),
         "kept": found.count,
         "reached": found.reached,
     }
 
 
-def _loss(row: dict[str, Cell]) -> str:
+def _loss(row: dict[str, written.Cell]) -> str:
     name = "modelled_drop" if row["drop"] is None else "drop"
     return f"{float(row[name] or 0.0):.3f} dB"
 

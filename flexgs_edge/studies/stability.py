@@ -26,19 +26,7 @@ from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.scene.source import SceneSource
-from flexgs_edge.studies.written import (
-    FIGURES,
-    Cell,
-    Experiment,
-    Row,
-    SceneStudy,
-    Study,
-    Table,
-    columns,
-    figures,
-    number,
-    write_study,
-)
+from flexgs_edge.studies import written
 
 BREAK = 3.0  # A method has broken if it loses more than this, in dB: twice the squared error
 LOST = f"lost {BREAK:g} dB"
@@ -55,7 +43,7 @@ SIZES = (0.5, 2.0)
 TRAINING, HELD_OUT, DISTANCE = "training", "held out", "distance"
 VIEW_HEADS = {
     "method": "method",
-    **FIGURES,
+    **written.FIGURES,
     "worst": "loss of the worst view (dB)",
     "allowed": "allowed for the worst (dB)",
     "within": "within",
@@ -107,30 +95,32 @@ def study_stability(
     quick: bool = False,
     amounts: Amounts | None = None,
     **words: Any,
-) -> Study:
+) -> written.Study:
     """Find the conditions under which methods break on a scene, and write them to a folder."""
     options = replace(options or CompressOptions(), **words)
     amounts = amounts or (QUICK if quick else FULL)
     if amounts.width is not None:
         options = replace(options, resolution=min(options.resolution, amounts.width))
 
-    def make(folder: Path) -> SceneStudy:
+    def make(folder: Path) -> written.SceneStudy:
         found: dict[str, CompressResult] = {}
         for place, (name, own) in enumerate(METHODS.items()):
             LOG.info("compressing: %s", name)
             asked = replace(options, effort=EFFORT, best_effort=True, report=None, dry_run=False, **own)
             found[name] = compress(scene, folder / f"{place}.fgs", asked, progress)
-        return SceneStudy.of(scene, found["best"], held_out(found), *poses(scene, options, progress, found, amounts))
+        return written.SceneStudy.of(
+            scene, found["best"], held_out(found), *poses(scene, options, progress, found, amounts)
+        )
 
-    return write_study("study stability", output, options.force, "Stability", _INTRO, make)
+    return written.write_study("study stability", output, options.force, "Stability", _INTRO, make)
 
 
-def held_out(found: dict[str, CompressResult]) -> Experiment:
+def held_out(found: dict[str, CompressResult]) -> written.Experiment:
     """Compare the methods by the mean and the worst of the held-out views."""
     rows = [_view_row(name, result) for name, result in found.items()]
-    table = Table(columns(**VIEW_HEADS), tuple(rows))
+    table = written.Table(written.columns(**VIEW_HEADS), tuple(rows))
     figure = "modelled_drop" if rows[0]["drop"] is None else "drop"
-    return Experiment(
+    return written.Experiment(
         "heldout",
         "The worst view",
         f"The results at the study's target, over the held-out views. A worst view within {WORST_TIMES:g} times the mean plus "
@@ -138,7 +128,7 @@ def held_out(found: dict[str, CompressResult]) -> Experiment:
         table,
         BarChart(
             "Mean and worst held-out view",
-            f"loss: {FIGURES[figure]}",
+            f"loss: {written.FIGURES[figure]}",
             [str(row["method"]).replace(", ", ",\n") for row in rows],
             {"mean": table.values(figure), "worst view": table.values("worst")},
             limit=BREAK,
@@ -151,7 +141,7 @@ def held_out(found: dict[str, CompressResult]) -> Experiment:
     )
 
 
-def _view_row(name: str, result: CompressResult) -> dict[str, Cell]:
+def _view_row(name: str, result: CompressResult) -> dict[str, written.Cell]:
     quality = result.quality
     assert quality is not None and quality.worst is not None
     measured = measurement_of(quality)
@@ -160,7 +150,7 @@ def _view_row(name: str, result: CompressResult) -> dict[str, Cell]:
     worst, allowed = measured.worst.loss(figure), WORST_TIMES * max(measured.loss(figure), 0.0) + WORST_MORE
     return {
         "method": name,
-        **figures(result.size, result.scene.ply_bytes, measured),
+        **written.figures(result.size, result.scene.ply_bytes, measured),
         "worst": round(worst, 4),
         "allowed": round(allowed, 4),
         "within": worst <= allowed,
@@ -223,11 +213,11 @@ def worst_tile(image: np.ndarray, reference: np.ndarray, side: int = TILE_SIDE) 
 
 def look(
     renderer: Renderer, original: SceneSource, others: dict[str, SceneSource], cameras: Sequence[Camera]
-) -> dict[str, dict[str, Cell]]:
+) -> dict[str, dict[str, written.Cell]]:
     """Fidelity of all scenes to the original over some views, in dB: mean, worst view and worst tile."""
     with renderer.load(original) as scene:
         references = [renderer.render(scene, camera) for camera in cameras]
-    found: dict[str, dict[str, Cell]] = {}
+    found: dict[str, dict[str, written.Cell]] = {}
     for name, source in others.items():
         with renderer.load(source) as scene:
             pairs = [(renderer.render(scene, camera), one) for camera, one in zip(cameras, references)]
@@ -241,18 +231,18 @@ def look(
 
 def poses(
     scene: str | Path, options: CompressOptions, progress: Progress, found: dict[str, CompressResult], amounts: Amounts
-) -> list[Experiment]:
+) -> list[written.Experiment]:
     """Measure fidelity from poses that were not scored, by distance and by kind."""
     run = open_run(scene, options, progress, photos=False)
     files = {name: load_scene(result.output or "").source for name, result in found.items()}
-    rows: list[dict[str, Cell]] = []
+    rows: list[dict[str, written.Cell]] = []
     base: dict[str, float] = {}
     with open_renderer(run) as renderer:
         every = make_poses(run, renderer, amounts)
         for made in progress.track(every, "poses", len(every)):
             for name, cells in look(renderer, run.source, files, made.cameras).items():
                 # Identical pictures have no finite fidelity, so nothing can be compared with them.
-                fidelity = math.inf if cells["fidelity"] is None else number(cells, "fidelity")
+                fidelity = math.inf if cells["fidelity"] is None else written.number(cells, "fidelity")
                 below = base.setdefault(name, fidelity) - fidelity
                 rows.append(
                     {
@@ -270,26 +260,26 @@ def poses(
     return [_by_distance(by_distance, base["best"]), _by_kind(others)]
 
 
-def _by_distance(rows: list[dict[str, Cell]], base: float) -> Experiment:
+def _by_distance(rows: list[dict[str, written.Cell]], base: float) -> written.Experiment:
     series, findings = [], []
     for name in METHODS:
         own = [row for row in rows if row["method"] == name and row["poses"] != TRAINING]
         places = [{**row, "amount": 1.0 if row["poses"] == HELD_OUT else row["amount"]} for row in own]
-        places.sort(key=lambda row: number(row, "amount"))
+        places.sort(key=lambda row: written.number(row, "amount"))
         series.append(
             Series(
                 name,
-                [number(row, "amount") for row in places],
-                [None if row["fidelity"] is None else number(row, "fidelity") for row in places],
-                broken=[number(row, "amount") for row in places if row["broke"] is not None],
+                [written.number(row, "amount") for row in places],
+                [None if row["fidelity"] is None else written.number(row, "fidelity") for row in places],
+                broken=[written.number(row, "amount") for row in places if row["broke"] is not None],
             )
         )
         findings.append(_near_and_far(places, name))
-    return Experiment(
+    return written.Experiment(
         "distance",
         "Nearer and farther",
         "Held-out poses are moved along their axes, to so many times the distance of the middle of the frame. " + _LOOK,
-        Table(columns(**POSE_HEADS), tuple(rows)),
+        written.Table(written.columns(**POSE_HEADS), tuple(rows)),
         LineChart(
             "Poses nearer and farther than the scored ones",
             "distance to the scene, times",
@@ -303,23 +293,25 @@ def _by_distance(rows: list[dict[str, Cell]], base: float) -> Experiment:
     )
 
 
-def _near_and_far(rows: Sequence[Row], name: str) -> str:
+def _near_and_far(rows: Sequence[written.Row], name: str) -> str:
     """A sentence: from which distances, nearer and farther, a method still stands."""
     broken = [row for row in rows if row["broke"] is not None]
-    words = ", ".join(f"{number(row, 'amount'):g}x ({_below(row)})" for row in broken)
-    gentle = ", ".join(f"{number(row, 'amount'):g}x {_below(row)}" for row in rows if row["amount"] in (0.5, 2.0))
+    words = ", ".join(f"{written.number(row, 'amount'):g}x ({_below(row)})" for row in broken)
+    gentle = ", ".join(
+        f"{written.number(row, 'amount'):g}x {_below(row)}" for row in rows if row["amount"] in (0.5, 2.0)
+    )
     return f"{name}: {gentle}; " + (f"broken at {words}." if broken else "stands everywhere.")
 
 
-def _below(row: Row) -> str:
+def _below(row: written.Row) -> str:
     if row["below"] is None:
         return "identical"
-    below = number(row, "below")
+    below = written.number(row, "below")
     return f"{abs(below):.1f} dB {'below' if below >= 0 else 'above'} its training poses"
 
 
-def _by_kind(rows: list[dict[str, Cell]]) -> Experiment:
-    table = Table(columns(**POSE_HEADS), tuple(rows))
+def _by_kind(rows: list[dict[str, written.Cell]]) -> written.Experiment:
+    table = written.Table(written.columns(**POSE_HEADS), tuple(rows))
     kinds = [kind for kind in dict.fromkeys((row["poses"], row["amount"]) for row in rows) if kind[0] != TRAINING]
     findings = []
     for name in METHODS:
@@ -330,7 +322,7 @@ def _by_kind(rows: list[dict[str, Cell]]) -> Experiment:
             f"{name}: {'broken at ' + ', '.join(broken) if broken else 'stands everywhere'}; worst tile "
             f"{tiles[TRAINING]} dB at training poses, {tiles[HELD_OUT]} dB at held-out ones."
         )
-    return Experiment(
+    return written.Experiment(
         "poses",
         "Between and above the path, other lenses and sizes",
         "Training poses, held-out ones, poses half way between each of these and the nearest training pose, turned up "
@@ -355,5 +347,5 @@ def _by_kind(rows: list[dict[str, Cell]]) -> Experiment:
     )
 
 
-def _kind(row: Row) -> str:
-    return str(row["poses"]) if row["amount"] is None else f"{row['poses']} {number(row, 'amount'):g}"
+def _kind(row: written.Row) -> str:
+    return str(row["poses"]) if row["amount"] is None else f"{row['poses']} {written.number(row, 'amount'):g}"

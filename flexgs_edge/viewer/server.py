@@ -181,7 +181,8 @@ class _Handler(socketserver.BaseRequestHandler):
         if resource is None:
             raise _Refused(HTTPStatus.NOT_FOUND)
         content, about = resource.content, {"Content-Type": resource.kind, "Accept-Ranges": "bytes"}
-        if resource.packed is not None and "range" not in headers and _takes_gzip(headers.get("accept-encoding", "")):
+        accepted = {word.strip().lower() for word in headers.get("accept-encoding", "").split(",")}
+        if resource.packed is not None and "range" not in headers and "gzip" in accepted:
             content, about = resource.packed, {"Content-Type": resource.kind, "Content-Encoding": "gzip"}
         if resource.policy is not None:
             about["Content-Security-Policy"] = f"{resource.policy}; frame-ancestors 'none'"
@@ -257,10 +258,6 @@ class _Handler(socketserver.BaseRequestHandler):
                     return
         except OSError:
             pass
-
-
-def _takes_gzip(accepted: str) -> bool:
-    return any(part.strip().lower() == "gzip" for part in accepted.split(","))
 
 
 def _part(asked: str | None, size: int) -> tuple[int, int] | None:

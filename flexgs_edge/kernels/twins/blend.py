@@ -22,8 +22,7 @@ from flexgs_edge.constants import (
 from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fexp2_within, fma, splat_exponent
 
 TILES_AT_ONCE = 256
-"""Tiles of a group. It bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed
-block."""
+"""Tiles of a group. It bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
 
 _LANE = np.arange(BLOCK * BLOCK)
 _LANE_X, _LANE_Y = (_LANE % BLOCK).astype(f32), (_LANE // BLOCK).astype(f32)

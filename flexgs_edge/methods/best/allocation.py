@@ -49,8 +49,7 @@ def choose(costs: RemovalCosts, bits: BitModel, multiplier: float) -> tuple[np.n
 
     Gaussians that no pose sees stay, without SH, because no cost of theirs is known.
 
-    `costs`: squared errors. `bits`: bits of a Gaussian by SH degree. `multiplier`: squared error that a bit is worth.
-    Returns [n] bool kept, [n] u8 SH degree kept.
+    `multiplier`: squared error that a bit is worth. Returns [n] bool kept, [n] u8 SH degree kept.
     """
     top, count = len(costs.sh), len(costs.removal)
     keep, degrees = np.empty(count, bool), np.empty(count, np.uint8)
@@ -82,8 +81,7 @@ def keep_one(keep: np.ndarray, costs: RemovalCosts) -> None:
 def keep_most(keep: np.ndarray, costs: RemovalCosts, most: int) -> None:
     """Keep no more than `most` rows: first go those that no pose sees, then those whose removal costs least.
 
-    `keep`: [n] bool, from `choose` or `OneDegree`; changed in place. `costs`: squared errors. `most`: most
-    rows.
+    `keep`: [n] bool, from `choose` or `OneDegree`; changed in place.
     """
     over = int(np.count_nonzero(keep)) - most
     if over > 0:

@@ -1,7 +1,5 @@
 """`--resume`: saves the rounds of a search in a folder, so that a killed run goes on from its last finished round."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -5,8 +5,6 @@ that a bit is worth) therefore asks for d = sqrt(multiplier * n / (2 ln 2 * s)).
 For geometry it is measured: one kind of value at a time is moved as a trial grid would move it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,9 +50,8 @@ def probe_slopes(
 ) -> Slopes:
     """Measure the slopes of the geometry; the scene is drawn five times from at most `most` poses.
 
-    `renderer`: with nothing loaded. `planes`: stored planes ([width, n] f32 by field); not changed. `origin`: [3] f64,
-    as in `SceneSource`. `cameras`: all scored poses. Those to draw from are evenly spread among them. `most`: most
-    poses to draw from.
+    `renderer`: with nothing loaded. `planes`: stored planes ([width, n] f32 by field); not changed. `origin`: [3] f64, as in
+    `SceneSource`. `cameras`: all scored poses; those to draw from are evenly spread among them.
     """
     count, some = planes["means"].shape[1], min(most, len(cameras))
     views = [cameras[i * len(cameras) // some] for i in range(some)]
@@ -112,9 +109,8 @@ def choose_steps(
 ) -> StepSizes:
     """Step sizes of every kind of value for a multiplier.
 
-    `slopes`: of the geometry. `weight2`: [n] f64, sums of squared weights of the kept Gaussians: an error e of a
-    coefficient in luma costs 3 w2 (Y e)^2. `degrees`: [n] u8, SH degree kept. `sh_degree`: SH degree of the scene.
-    `multiplier`: squared error that a bit is worth.
+    `weight2`: [n] f64, sums of squared weights of the kept Gaussians: an error e of a coefficient in luma costs 3 w2 (Y e)^2.
+    `degrees`: [n] u8, SH degree kept. `sh_degree`: of the scene. `multiplier`: squared error that a bit is worth.
     """
 
     def colour(rows: np.ndarray) -> float:
@@ -155,8 +151,7 @@ def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray)
     Without this, one Gaussian far away and in no view could ask for position steps as large as the scene itself:
     docs/results/stability.md
 
-    `steps`: as chosen. `planes`: stored planes ([width, n] f32 by field). `seen`: [n] bool, rows that some pose sees.
-    They are always in, because `holdable` makes steps coarser for them.
+    `steps`: as chosen. `seen`: [n] bool, rows that some pose sees. `holdable` makes steps coarser for them.
     """
     if not seen.any():
         return np.ones(len(seen), bool)

@@ -122,22 +122,36 @@ def put_costs(parts: CostParts, rows: slice, sums: Any) -> None:
 
 
 def measure_costs(
+    renderer: Renderer,
+    scene: DeviceScene,
+    cameras: Sequence[Camera],
+    sh_costs: bool = True,  # Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
+    progress: Progress = SILENT,
+) -> RemovalCosts:
+    """Costs over all poses from one pass; see `measure_parts`."""
+    degree = scene.sh_degree if sh_costs else 0
+    return RemovalCosts.of([measure_parts(renderer, scene, cameras, degree, progress)], renderer.storage)
+
+
+def measure_parts(
     renderer: Renderer,  # draws the views
     scene: DeviceScene,  # loaded with room for the sums of this pass
-    cameras: Sequence[Camera],  # the scored poses
-    sh_costs: bool = True,  # Measure the costs of dropping SH degrees too (default). Otherwise their arrays are empty.
+    cameras: Sequence[Camera],  # the scored poses, or a part of them
+    degree: int,  # as for `cost_sums`
     progress: Progress = SILENT,  # told of each view
-) -> RemovalCosts:
+    drawn: Callable[[int, np.ndarray], None] | None = None,  # takes the place of each view and its picture
+) -> CostParts:
     """Measure costs in one pass, which takes about twice the time of rendering the poses."""
-    degree = scene.sh_degree if sh_costs else 0
     costs = ViewSums(renderer, scene, [cost_sums(renderer, degree)])
     try:
-        for _ in progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras)):
-            pass
+        views = progress.track(costs.draw("removal_sums", cameras), "measuring costs", len(cameras))
+        for place, picture in enumerate(views):
+            if drawn is not None:
+                drawn(place, picture())
         found = cost_parts(degree, scene.count, renderer.storage)
         for rows, (sums,) in costs.parts():
             put_costs(found, rows, sums)
-        return RemovalCosts.of([found], renderer.storage)
+        return found
     finally:
         costs.release()
 

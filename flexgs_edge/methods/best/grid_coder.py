@@ -1,7 +1,5 @@
 """Codes the grids of a search with the real coder, so that their sizes are exact."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Makes the candidates for a `.fgs`: what a multiplier keeps, fine-tuned, on its grid, coded and measured."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Brings a result to what was asked for, without making it anew: one that is a little too large, or better than need be."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

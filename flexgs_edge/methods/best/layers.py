@@ -3,8 +3,6 @@
 Nothing is computed again when a file is cut: cutting drops the least important Gaussians.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -88,8 +88,7 @@ class MemoryPlan:
 def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera], folder: Path) -> Storage:
     """Memory if the scene and its search fit, else scratch files; logs where these go and how large they may get.
 
-    `run`: planned, with a scene. `renderer`: with nothing loaded. `scored`: the scored poses. `folder`: for scratch
-    files. Raises `BudgetError` when not even the views fit, or the disk is too small.
+    `renderer`: with nothing loaded. Raises `BudgetError` when not even the views fit, or the disk is too small.
     """
     source, options, budget = run.source, run.options, run.budget
     plan, largest = MemoryPlan.of(run, renderer, scored), largest_of(scored)

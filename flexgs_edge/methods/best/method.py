@@ -4,8 +4,6 @@
 search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluator`).
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -55,9 +53,8 @@ MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResult:
     """Compress a scene into a `.fgs` of version 2.
 
-    `run`: planned, with views and a target. `renderer`: draws the views. It gets the storage that the search needs.
-    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
-    fit.
+    `run`: planned, with views and a target. `renderer`: draws the views. It gets the storage that the search needs. Raises
+    `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not fit.
     """
     assert renderer is not None  # the plan has refused runs without views
     output = run.output.path
@@ -196,8 +193,7 @@ def search_best(
 ) -> tuple[Product, SearchResult]:
     """Search, and return the product to write and all candidates that led to it.
 
-    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not
-    fit.
+    Raises `TargetError` when nothing holds and `best_effort` is not set. Raises `BudgetError` when the scene does not fit.
     """
     source, options, target = run.source, run.options, run.target
     plan = MemoryPlan.of(run, renderer, poses.cameras)

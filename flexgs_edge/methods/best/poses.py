@@ -95,8 +95,7 @@ def margin_of(
 ) -> list[Camera]:
     """Five made poses for every eight.
 
-    `renderer`: with nothing loaded. `source`: the original. `poses`: poses that are scored, the most important first.
-    `cameras`: all training poses.
+    `renderer`: with nothing loaded. `poses`: those that are scored, the most important first. `cameras`: all training poses.
     """
     turns = [(camera, TURN[place % len(TURN)]) for place, camera in enumerate(poses)]
     depths = iter(visible_depths(renderer, source, [camera for camera, times in turns if times]))
@@ -245,7 +244,7 @@ class ScoredPoses:
 
         We look at them twice as finely as at others in the mean: docs/results/tuning.md#needed
 
-        `views`: the views. `renderer`: with nothing loaded. `source`: the original.
+        `renderer`: with nothing loaded. `source`: the original.
         """
         poses = [pose for view in views for pose in poses_beside(view, self.given)]
         poses += margin_of(renderer, source, poses, self.given)

@@ -4,8 +4,6 @@ Removed Gaussians interact, so costs that were measured once would mislead. Each
 the original's renders. Searches start from the snapshots that the rounds leave behind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from weakref import WeakMethod
@@ -23,6 +21,7 @@ from flexgs_edge.methods.best.costs import (
     cost_bytes,
     cost_parts,
     cost_sums,
+    measure_parts,
     put_costs,
 )
 from flexgs_edge.methods.best.effort import LEAST_VIEWS
@@ -58,12 +57,11 @@ class PruneRounds:
     Where arrays lie in files, snapshots that a search hardly needs again let their planes go.
 
     `original`: scored poses and those between them. If colours are refitted, the original's renders are put into its
-    references, which are empty at first. `source`: the whole scene. Neighbours in space become neighbours in memory, so
-    that views are drawn faster. `unseen_share`: share of the Gaussians that no pose sees to keep, 0 to 1 (default:
-    all). Those that are largest and most opaque stay first. `checkpoint`: keeps every round. Rounds that it holds
-    already are read instead of computed. `rows`: [n] i64, rows of the scene that the rounds begin with, without dead
-    splats, in the order of the planes. `snapshots`: the results. `unseen`: how many rows no scored pose sees. Raises
-    `InputError` if nothing is left of the scene.
+    references, which are empty at first. `source`: the whole scene. Neighbours in space become neighbours in memory, so that
+    views are drawn faster. `unseen_share`: share of the Gaussians that no pose sees to keep, 0 to 1 (default: all). Those that
+    are largest and most opaque stay first. `checkpoint`: keeps every round. Rounds that it holds already are read instead of
+    computed. `rows`: [n] i64, rows of the scene that the rounds begin with, without dead splats, in the order of the planes.
+    `snapshots`: the results. `unseen`: how many rows no scored pose sees. Raises `InputError` if nothing is left of the scene.
     """
 
     def __init__(
@@ -270,21 +268,15 @@ class PruneRounds:
         return True
 
     def _measure(self, scene: DeviceScene, views: Sequence[int], keep: bool = False) -> CostParts:
-        costs = ViewSums(self.original.renderer, scene, [cost_sums(self.original.renderer, scene.sh_degree)])
-        try:
-            keep = keep and self.refit
-            drawn = costs.draw("removal_sums", [self.original.cameras[view] for view in views])
-            for view, picture in zip(
-                self.original.progress.track(views, "measuring costs", len(views)), drawn, strict=True
-            ):
-                if keep:
-                    self.original.references.add(view, picture())
-            found = cost_parts(scene.sh_degree, scene.count, self.storage)
-            for rows, (sums,) in costs.parts():
-                put_costs(found, rows, sums)
-            return found
-        finally:
-            costs.release()
+        """Measure costs over some of the poses; `keep` their pictures, as references, if colours are refitted."""
+        original = self.original
+
+        def drawn(place: int, picture: np.ndarray) -> None:
+            original.references.add(views[place], picture)
+
+        cameras = [original.cameras[view] for view in views]
+        kept = drawn if keep and self.refit else None
+        return measure_parts(original.renderer, scene, cameras, scene.sh_degree, original.progress, kept)
 
     def _measure_and_refit(self, scene: DeviceScene, planes: dict[str, np.ndarray], views: Sequence[int]) -> CostParts:
         makers = [cost_sums(self.original.renderer, scene.sh_degree, first=4), normal_sums(self.original.renderer)]

@@ -6,8 +6,6 @@ noise. So candidates are placed by secant steps inside of a bracket: the largest
 it that misses. The best candidate then loses Gaussians until it hardly holds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -20,8 +18,7 @@ from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.progress import LOG
 
 NEAREST = 0.1
-"""A new point keeps this share of the interval between its neighbours away from both, since curves are not quite
-smooth."""
+"""A new point keeps this share of the interval between its neighbours away from both, since curves are not quite smooth."""
 MOST_TRIED = 6
 """Most candidates with those that lost Gaussians; while none holds, and of a size, most candidates."""
 AIM = -0.01  # Log of the share that we aim at
@@ -34,10 +31,9 @@ LARGEST_STRIDE = 1.2  # Largest change of the log of the multiplier beyond what 
 def next_point(points: Iterable[tuple[float, float]], slope: float, stride: float, least: float = 0.5) -> float:
     """Position where the excess should be just below zero: false position, kept away from measured points.
 
-    `points`: (position, excess) of the measured points, at least one. `slope`: excess per position, used before two
-    points are measured. Its sign must be right. `stride`: largest move beyond all points; twice that once a slope has
-    been measured. `least`: a measured slope counts as at least this share of `slope`. Points that differ by chance have
-    no slope of their own.
+    `points`: (position, excess) of the measured points, at least one. `slope`: excess per position, used before two points are
+    measured. Its sign must be right. `stride`: largest move beyond all points; twice that once a slope has been measured.
+    `least`: a measured slope counts as at least this share of `slope`. Points that differ by chance have no slope of their own.
 
     >>> round(next_point([(0.0, -1.0), (1.0, 1.0)], 2.0, 1.0), 3)
     0.495
@@ -64,8 +60,7 @@ def next_point(points: Iterable[tuple[float, float]], slope: float, stride: floa
 def weighed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """The points for `next_point`; after several on one side, the other side's excess counts half for each beyond the first.
 
-    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target
-    slowly.
+    This is the Illinois rule. The log of a loss is curved, so that plain false position would approach the target slowly.
     """
     sides = [excess <= 0.0 for _, excess in points]
     streak = next((count for count, side in enumerate(reversed(sides)) if side != sides[-1]), len(sides))

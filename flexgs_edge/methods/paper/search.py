@@ -253,7 +253,10 @@ def _refine(search: _Search, best: Step, box: list[Choice], steps: int) -> Step:
         open_points = [
             choice
             for choice in box
-            if search.size(choice) < best.size and not search.known(choice) and not _ruled_out(choice, failed)
+            if search.size(choice) < best.size
+            and not search.known(choice)
+            # A point with rates at least as high as those of one that failed would fail too.
+            and not any(choice.prune >= other.prune and choice.sh >= other.sh for other in failed)
         ]
         if not open_points:
             break
@@ -321,8 +324,3 @@ def _box(centre: Choice, to_zero: bool) -> list[Choice]:
         return range(low, min(value + REACH, top) + 1, GRID)
 
     return [Choice(p, s) for p in line(centre.prune, MAX_PRUNE) for s in line(centre.sh, 1000) if p + s <= 1000]
-
-
-def _ruled_out(choice: Choice, failed: list[Choice]) -> bool:
-    """Whether both rates are at least as high as those of a point that failed: it would fail too."""
-    return any(choice.prune >= other.prune and choice.sh >= other.sh for other in failed)
