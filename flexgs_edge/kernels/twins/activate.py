@@ -7,15 +7,9 @@ from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32,
 
 
 def activate(
-    size: Size,
-    stride: int,
-    antialiased: int,
-    log_scales: Array,
-    quats: Array,
-    logits: Array,
-    cov: Array,
+    size: Size, stride: int, antialiased: int, log_scales: Array, quats: Array, logits: Array, cov: Array,
     log2_opacity: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Compute the 3D covariance or its factor ([6, stride]), and log2 of the opacity ([stride], -inf below ALPHA_MIN)."""
     s0, s1, s2 = (fexp2(row * f32(LOG2_E)) for row in log_scales)
     big = np.fmax(np.fmax(np.abs(quats[0]), np.abs(quats[1])), np.fmax(np.abs(quats[2]), np.abs(quats[3])))

@@ -61,25 +61,10 @@ def sh_slopes(degree: int, x: Array, y: Array, z: Array) -> list[Triple]:
 
 
 def project_backward(
-    size: Size,
-    count: int,
-    stride: int,
-    base: int,
-    degree: int,
-    antialiased: int,
-    wide: float,
-    camera: Array,
-    means: Array,
-    log_scales: Array,
-    quats: Array,
-    logits: Array,
-    sh_rest: Array,
-    degrees: Array,
-    records: Array,
-    sums: Array,
-    pace: Array,
-    gradient: Array,
-) -> None:
+    size: Size, count: int, stride: int, base: int, degree: int, antialiased: int, wide: float, camera: Array,
+    means: Array, log_scales: Array, quats: Array, logits: Array, sh_rest: Array, degrees: Array, records: Array,
+    sums: Array, pace: Array, gradient: Array,
+) -> None:  # fmt: skip
     """Gradients ([14 + 3 K, stride]) of the rows that the view shows, and the share of a whole step that they take ([stride]).
 
     The share is 0 for other rows, and below 1 for those whose largest deviation over their depth is above `wide`.
@@ -136,15 +121,9 @@ def _colours(
 
 
 def _geometry(
-    antialiased: int,
-    cam: Array,
-    means: Array,
-    log_scales: Array,
-    quats: Array,
-    record: Array,
-    moments: Array,
+    antialiased: int, cam: Array, means: Array, log_scales: Array, quats: Array, record: Array, moments: Array,
     toward: Triple,
-) -> Array:
+) -> Array:  # fmt: skip
     """Gradients of means, log-scales and quaternions ([10, n])."""
     one, two = f32(1), f32(2)
     s = [fexp2(row * f32(LOG2_E)) for row in log_scales]

@@ -92,15 +92,9 @@ def _add_moments(lanes: dict[str, Array], pair: Array, slope: Array, place: Arra
 
 
 def _add_sums(
-    stats: int,
-    tiles: int,
-    lists: _Lists,
-    entries: _Entries,
-    rest: Array | None,
-    rows_of: Array,
-    hits: Array,
+    stats: int, tiles: int, lists: _Lists, entries: _Entries, rest: Array | None, rows_of: Array, hits: Array,
     sums: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Add to hits and to the fixed-point sums, in the kernel's order: lanes over blocks, then the tree over lanes.
 
     `rest` is the residual, [3, units, 16].
@@ -132,26 +126,10 @@ def _add_sums(
 
 
 def blend(
-    size: Size,
-    tiles_x: int,
-    blocks: int,
-    width: int,
-    height: int,
-    resume: int,
-    finish: int,
-    background_r: float,
-    background_g: float,
-    background_b: float,
-    ends: Array,
-    pairs: Array,
-    records: Array,
-    state: Array,
-    image: Array,
-    hits: Array | None = None,
-    sums: Array | None = None,
-    rest: Array | None = None,
-    stats: int = 0,
-) -> None:
+    size: Size, tiles_x: int, blocks: int, width: int, height: int, resume: int, finish: int, background_r: float,
+    background_g: float, background_b: float, ends: Array, pairs: Array, records: Array, state: Array, image: Array,
+    hits: Array | None = None, sums: Array | None = None, rest: Array | None = None, stats: int = 0,
+) -> None:  # fmt: skip
     """Blend the tile lists into `state`, and in the end into `image` ([3, padded height, padded width]).
 
     For statistics beyond hits and weights, `image` is finished already, and only read.
@@ -193,16 +171,9 @@ def blend(
 
 
 def _blend_blocks(
-    lists: _Lists,
-    rows_of: Array,
-    records: Array,
-    pixels: tuple[Array, Array],
-    colour: Array,
-    trans: Array,
-    stats: int,
-    whole: Array | None,
-    rest: Array | None,
-) -> _Entries | None:
+    lists: _Lists, rows_of: Array, records: Array, pixels: tuple[Array, Array], colour: Array, trans: Array, stats: int,
+    whole: Array | None, rest: Array | None,
+) -> _Entries | None:  # fmt: skip
     """Blend every block's list into `colour` and `trans`; returns the entries for statistics if they are asked for."""
     shape = (len(lists.pair) if stats else 0, 16)
     entries = _Entries(

@@ -6,19 +6,9 @@ from flexgs_edge.kernels.twins.arithmetic import Array, Size
 
 
 def dequantize(
-    size: Size,
-    count: int,
-    groups: int,
-    bits: int,
-    plane_bytes: int,
-    first: int,
-    rows: int,
-    stride: int,
-    planes: Array,
-    low: Array,
-    step: Array,
-    values: Array,
-) -> None:
+    size: Size, count: int, groups: int, bits: int, plane_bytes: int, first: int, rows: int, stride: int, planes: Array,
+    low: Array, step: Array, values: Array,
+) -> None:  # fmt: skip
     """Dequantize rows [first, first + rows) of every channel into `values` ([channels, stride])."""
     row = np.arange(first, first + rows, dtype=np.int64)
     group = ((row + 1) * groups - 1) // count

@@ -43,17 +43,9 @@ def price_bits(degree: int, prices: Array, degrees: Array, pace: Array, values: 
 
 
 def adam(
-    planes: int,
-    decay_first: float,
-    decay_second: float,
-    rates: Array,
-    pace: Array,
-    gradient: Array,
-    powers: Array,
-    first: Array,
-    second: Array,
-    values: Array,
-) -> None:
+    planes: int, decay_first: float, decay_second: float, rates: Array, pace: Array, gradient: Array, powers: Array,
+    first: Array, second: Array, values: Array,
+) -> None:  # fmt: skip
     """One step of Adam for the rows with a share above 0; running means, powers of the decays and values change in place."""
     rows = np.flatnonzero(pace > 0)
     one, least = f32(1), f32(GRADIENT_MIN)
@@ -83,18 +75,9 @@ def _on_grid(values: Array, step: np.float32) -> Array:
 
 
 def snap(
-    size: Size,
-    stride: int,
-    degree: int,
-    steps: Array,
-    values: Array,
-    means: Array,
-    log_scales: Array,
-    quats: Array,
-    logits: Array,
-    sh_dc: Array,
-    sh_rest: Array,
-) -> None:
+    size: Size, stride: int, degree: int, steps: Array, values: Array, means: Array, log_scales: Array, quats: Array,
+    logits: Array, sh_dc: Array, sh_rest: Array,
+) -> None:  # fmt: skip
     """Round values ([14 + 3 K, stride]) to those that a file of these steps decodes to. A step of 0 leaves them as they are."""
     means[:] = _on_grid(values[:AT_SCALE], steps[0])
     log_scales[:] = _on_grid(values[AT_SCALE:AT_QUAT], steps[1])
@@ -125,36 +108,11 @@ def snap(
 
 
 def descend(
-    size: Size,
-    stride: int,
-    degree: int,
-    planes: int,
-    antialiased: int,
-    priced: int,
-    follows: int,
-    decay_first: float,
-    decay_second: float,
-    share: float,
-    rates: Array,
-    prices: Array,
-    steps: Array,
-    degrees: Array,
-    pace: Array,
-    gradient: Array,
-    powers: Array,
-    first: Array,
-    second: Array,
-    values: Array,
-    mean: Array,
-    means: Array,
-    log_scales: Array,
-    quats: Array,
-    logits: Array,
-    sh_dc: Array,
-    sh_rest: Array,
-    cov: Array,
-    log2_opacity: Array,
-) -> None:
+    size: Size, stride: int, degree: int, planes: int, antialiased: int, priced: int, follows: int, decay_first: float,
+    decay_second: float, share: float, rates: Array, prices: Array, steps: Array, degrees: Array, pace: Array,
+    gradient: Array, powers: Array, first: Array, second: Array, values: Array, mean: Array, means: Array,
+    log_scales: Array, quats: Array, logits: Array, sh_dc: Array, sh_rest: Array, cov: Array, log2_opacity: Array,
+) -> None:  # fmt: skip
     """`price_bits` if `priced`, `adam`, `follow` if it `follows`, `snap` and `activate`, one after the other."""
     if priced:
         price_bits(degree, prices, degrees, pace, values, gradient)

@@ -114,24 +114,10 @@ def _from_factor(
 
 
 def project(
-    size: Size,
-    count: int,
-    stride: int,
-    base: int,
-    first: int,
-    degree: int,
-    antialiased: int,
-    blocks: Array,
-    camera: Array,
-    means: Array,
-    cov: Array,
-    log2_opacity: Array,
-    sh_dc: Array,
-    sh_rest: Array,
-    records: Array,
-    keys: Array,
-    bounds: Array,
-) -> None:
+    size: Size, count: int, stride: int, base: int, first: int, degree: int, antialiased: int, blocks: Array,
+    camera: Array, means: Array, cov: Array, log2_opacity: Array, sh_dc: Array, sh_rest: Array, records: Array,
+    keys: Array, bounds: Array,
+) -> None:  # fmt: skip
     """Project the rows of some blocks to splat records ([N, 16]), depth keys and bounds ([N]) from row `base` on."""
     cam, own = camera, block_rows(blocks, first, count)
     px, py, pz = means[:, own]

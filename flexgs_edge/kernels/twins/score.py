@@ -41,21 +41,9 @@ def _put_back(sums: Array, planes: Array) -> None:
 
 
 def add_costs(
-    size: Size,
-    count: int,
-    stride: int,
-    base: int,
-    first: int,
-    degree: int,
-    planes: int,
-    plane: int,
-    blocks: Array,
-    camera: Array,
-    means: Array,
-    sh_rest: Array,
-    sums: Array,
-    costs: Array,
-) -> None:
+    size: Size, count: int, stride: int, base: int, first: int, degree: int, planes: int, plane: int, blocks: Array,
+    camera: Array, means: Array, sh_rest: Array, sums: Array, costs: Array,
+) -> None:  # fmt: skip
     """Add squared errors and squared weights of a view to 128-bit sums, and the moments w2 d and w2 |d|^2.
 
     d is the colour of the SH above each lower degree; `costs` is [stride / SUM_LANES, 4 + 4 * degree, SUM_LANES] i64.
@@ -89,19 +77,9 @@ def add_costs(
 
 
 def sh_residual(
-    size: Size,
-    count: int,
-    stride: int,
-    base: int,
-    first: int,
-    degree: int,
-    planes: int,
-    blocks: Array,
-    camera: Array,
-    means: Array,
-    sums: Array,
-    normal: Array,
-) -> None:
+    size: Size, count: int, stride: int, base: int, first: int, degree: int, planes: int, blocks: Array, camera: Array,
+    means: Array, sums: Array, normal: Array,
+) -> None:  # fmt: skip
     """Add Y_k sum(alpha T r) and |Y_k| sum(alpha T) of one view to `normal` ([stride / SUM_LANES, K + 1, 4, SUM_LANES])."""
     own, span = block_rows(blocks, first, count), slice(base, base + count)
     weight, *seen = (_sum_values(sums[span, c], 1.0 / FIXED_WEIGHT) for c in range(4))

@@ -41,19 +41,9 @@ def _shown(values: Array) -> Array:
 
 
 def dssim_slopes(
-    launched: Size,
-    across: int,
-    rows: int,
-    columns: int,
-    stride: int,
-    plane: int,
-    wide: int,
-    size: int,
-    taps: Array,
-    image: Array,
-    target: Array,
-    slopes: Array,
-) -> None:
+    launched: Size, across: int, rows: int, columns: int, stride: int, plane: int, wide: int, size: int, taps: Array,
+    image: Array, target: Array, slopes: Array,
+) -> None:  # fmt: skip
     """What each window's SSIM gains by a change of its moments, named by the window's last pixel ([3, 3, wide])."""
     count, two = rows * stride, f32(2)
     sums, m = np.zeros((5, count + size), f32), np.empty((5, count), f32)
@@ -76,20 +66,9 @@ def dssim_slopes(
 
 
 def dssim_residual(
-    launched: Size,
-    across: int,
-    rows: int,
-    stride: int,
-    plane: int,
-    wide: int,
-    factor: float,
-    size: int,
-    taps: Array,
-    slopes: Array,
-    image: Array,
-    target: Array,
-    residual: Array,
-) -> None:
+    launched: Size, across: int, rows: int, stride: int, plane: int, wide: int, factor: float, size: int, taps: Array,
+    slopes: Array, image: Array, target: Array, residual: Array,
+) -> None:  # fmt: skip
     """Add the gradient of all windows' SSIM by `image`, times `factor`, to `residual`."""
     count = rows * stride
     for channel in range(3):

@@ -82,17 +82,9 @@ def _draft_places(room: Array) -> Array:
 
 
 def tile_count(
-    size: Size,
-    start: int,
-    count: int,
-    width: float,
-    height: float,
-    ids: Array,
-    records: Array,
-    room: Array,
-    drafts: Array,
-    counts: Array,
-) -> None:
+    size: Size, start: int, count: int, width: float, height: float, ids: Array, records: Array, room: Array,
+    drafts: Array, counts: Array,
+) -> None:  # fmt: skip
     """Drafts (row, tile, mask) of the splats [start, start + count), and their counts by tile and block of splats."""
     batch = ids[start : start + count]
     splat, tile, mask = list_pairs(batch, records, f32(width), f32(height))
