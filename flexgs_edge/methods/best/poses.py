@@ -129,12 +129,12 @@ def needed_poses(
     if not scored:
         return []
     points = points[:, :: -(-points.shape[1] // POINTS)] if points.shape[1] else points
-    there = _Others.of([_seen(camera, points, near) for camera in scored])
+    there = _Seen.by([_seen(camera, points, near) for camera in scored])
     found = list(rest)
     found += [between(camera, other) for camera, other in _pairs(given, deciding, there, points, near)]
     known = [_known(_seen(camera, points, near), there) for camera in found]
     bounds = np.array([_gain(_seen(camera, points, near), sums) for camera, sums in zip(found, known, strict=True)])
-    added: list[_Others] = []
+    added: list[_Seen] = []
     upto = [0] * len(found)
     needed: list[Camera] = []
     # What a pose adds only falls, so what it added before is an upper bound.
@@ -145,7 +145,7 @@ def needed_poses(
         seen = _seen(found[best], points, near)
         if upto[best] == len(added):
             needed.append(found[best])
-            added.append(_Others.of([seen]))
+            added.append(_Seen.by([seen]))
             bounds[best] = -1.0
             continue
         for other in added[upto[best] :]:
@@ -164,27 +164,21 @@ def poses_beside(view: Camera, given: Sequence[Camera]) -> list[Camera]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Which points a pose shows ([n] bool), their directions ([3, n] f64), and their distances in focal lengths ([n] f64)."""
+    """Which points a pose shows ([n] bool), their directions ([3, n] f64), and their distances in focal lengths ([n] f64).
 
-    shown: np.ndarray
-    ahead: np.ndarray
-    away: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Others:
-    """What several poses see: the arrays of `_Seen`, one row a pose."""
+    Of several poses, each array has one row a pose.
+    """
 
     shown: np.ndarray
     ahead: np.ndarray
     away: np.ndarray
 
     @staticmethod
-    def of(poses: Sequence[_Seen]) -> _Others:
-        return _Others(*(np.stack([getattr(pose, name) for pose in poses]) for name in ("shown", "ahead", "away")))
+    def by(poses: Sequence[_Seen]) -> _Seen:
+        return _Seen(*(np.stack([getattr(pose, name) for pose in poses]) for name in ("shown", "ahead", "away")))
 
-    def without(self, place: int) -> _Others:
-        return _Others(*(np.delete(values, place, axis=0) for values in (self.shown, self.ahead, self.away)))
+    def without(self, place: int) -> _Seen:
+        return _Seen(*(np.delete(values, place, axis=0) for values in (self.shown, self.ahead, self.away)))
 
 
 def _seen(camera: Camera, points: np.ndarray, near: float) -> _Seen:
@@ -193,7 +187,7 @@ def _seen(camera: Camera, points: np.ndarray, near: float) -> _Seen:
     return _Seen(in_picture(camera, points, near), ahead / away, away / camera.fx)
 
 
-def _known(seen: _Seen, others: _Others) -> np.ndarray:
+def _known(seen: _Seen, others: _Seen) -> np.ndarray:
     """[n] f64, how often other poses show each point from about the same direction."""
     alike = np.maximum(1.0 - (1.0 - (seen.ahead * others.ahead).sum(axis=1)) / SAME_VIEW, 0.0)
     found: np.ndarray = (others.shown * alike * np.square(np.minimum(seen.away / others.away, 1.0))).sum(axis=0)
@@ -206,7 +200,7 @@ def _gain(seen: _Seen, known: np.ndarray) -> float:
 
 
 def _pairs(
-    given: Sequence[Camera], deciding: Sequence[Camera], there: _Others, points: np.ndarray, near: float
+    given: Sequence[Camera], deciding: Sequence[Camera], there: _Seen, points: np.ndarray, near: float
 ) -> list[tuple[Camera, Camera]]:
     """The nearest six of each given pose that would itself add enough: all others have enough poses round them.
 
