@@ -44,8 +44,7 @@ class Format:
     writer: str | None = None
     frame: Frame = RDF  # Directions of the axes in files of this format
     reach: float = float("inf")  # Largest coordinate that it holds, scene units
-    # From positions [3, n] f64 and the largest coordinate of the scene to the largest errors [n] f64 of a coordinate,
-    # at least
+    # From positions [3, n] f64 and the largest coordinate of the scene to the largest errors [n] f64 of a coordinate, at least
     position_error: Callable[[np.ndarray, float], np.ndarray] = _as_float32
     keeps_origin: bool = False  # It holds the origin of a scene far from zero apart, in float64
     max_degree: int = 3  # Highest SH degree

@@ -25,8 +25,7 @@ LARGEST_FILE = 1 << 20
 class Reading:
     """How to read a scene file."""
 
-    # The frame of the file's axes, if it breaks the rule of its format. Default: as the file says, else as its format
-    # has it.
+    # The frame of the file's axes, if it breaks the rule of its format. Default: as the file says, else as its format has it.
     frame: Frame | None = None
     lod: int | None = None  # Level of detail of a streamed scene, 0 is the finest. Default: the finest that is there.
     sh_degree: int | None = None  # Leave out SH above this degree. Default: keep all.

@@ -249,12 +249,8 @@ def choose_device(spec: str | None, devices: list[DeviceInfo]) -> tuple[DeviceIn
     for device in matches:
         if device.usable:
             others = [f"{d.index}" for d in matches if d is not device and d.usable]
-            more = (
-                f"; the first of {len(others) + 1} that match, --device {', '.join(others)} for others"
-                if others
-                else ""
-            )
-            return device, f"asked for by --device {spec}{more}"
+            more = f"; the first of {len(others) + 1} that match, --device {', '.join(others)} for others"
+            return device, f"asked for by --device {spec}{more if others else ''}"
     raise DeviceError(f"--device {spec}: failed the self-test: {listing}. {RETEST}. To go on, {HINT}")
 
 

@@ -68,8 +68,7 @@ class QuantizedArray:
     channels: int  # channels (planes)
     low: np.ndarray
     step: np.ndarray
-    # [channels, ceil(count * bits / 8)] u8; the code of row i starts at bit i * bits of its plane, least significant
-    # bit first.
+    # [channels, ceil(count * bits / 8)] u8; the code of row i starts at bit i * bits of its plane, least significant bit first.
     planes: np.ndarray
 
     @property

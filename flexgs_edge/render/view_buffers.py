@@ -63,10 +63,9 @@ class ViewBuffers:
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
         # sums need is checked here too, so that one error message names a limit that is large enough.
         later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + target_bytes(scene, self.size)
-        what = (
-            f"a view of {count} Gaussians" if rows is None else f"a view that shows {count} of {scene.count} Gaussians"
-        )
+        what = f"a view of {count} Gaussians"
         if rows is not None:
+            what = f"a view that shows {count} of {scene.count} Gaussians"
             shapes |= chunk_shapes(scene.compact_rows)
             later += scene.shown_bytes * rows - scene.later_bytes
             size = shapes_bytes(shapes)

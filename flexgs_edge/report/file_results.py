@@ -22,8 +22,7 @@ class ConversionLoss:
     or not drawn.
     """
 
-    # Median and largest errors of positions (scene units, and over the splat's size), log-scales, opacities and
-    # colours.
+    # Median and largest errors of positions (scene units, and over the splat's size), log-scales, opacities and colours.
     values: dict[str, tuple[float, float]]
     views: int = 0  # views that were compared, drawn by `cameras`
     cameras: str = ""

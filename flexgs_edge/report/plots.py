@@ -54,8 +54,7 @@ class Series:
     y: Sequence[float | None]
     line: bool = True  # join the points by a line
     notes: Sequence[str] = ()  # text beside each point
-    # x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the
-    # chart.
+    # x of points to cross out, where quality counts as broken. Points without a y are crossed out at the top of the chart.
     broken: Sequence[float] = ()
 
 

@@ -94,8 +94,7 @@ class Original:
     origin: np.ndarray  # [3] f64, as in `SceneSource`
     cameras: Sequence[Camera]  # scored poses
     references: References  # renders of the original from `cameras`, then from `between`
-    # Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between
-    # them.
+    # Further poses, if there are descents. One that knew only the scored poses would fit these, and get worse between them.
     between: Sequence[Camera] = ()
     progress: Progress = SILENT  # told of each view
     steps: int = 0  # steps of the descent to the first candidate; 0 (default): colours are refitted instead

@@ -142,9 +142,6 @@ def open_checkpoint(
     key = fingerprint(run.source, scored, words, options.near, bool(options.antialiased), list(FIELD))
     checkpoint = Checkpoint(folder / f".flexgs-resume-{key[:16]}")
     if checkpoint.rounds:
-        LOG.info(
-            "%s: an earlier run was cut short after %d rounds: going on from there",
-            checkpoint.folder,
-            checkpoint.rounds,
-        )
+        where = checkpoint.folder, checkpoint.rounds
+        LOG.info("%s: an earlier run was cut short after %d rounds: going on from there", *where)
     return checkpoint
