@@ -12,15 +12,16 @@ before it is added or compared, and no sum depends on the order of its terms.
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.cameras.candidates import MOST_VIEWS, Candidate, Show, Stage, look
+from flexgs_edge.cameras.candidates import MOST_VIEWS, Candidate, Show, Stage, ThingStage, look
 from flexgs_edge.cameras.directions import Frames, fibonacci
 from flexgs_edge.cameras.scene_sample import Gaussians, Part, SceneSample, sample_scene
 from flexgs_edge.cameras.up import Stands, find_up, given_up
+from flexgs_edge.constants import DEFAULT_HOLDOUT
 from flexgs_edge.errors import InputError
 
 LEAST_VIEWS = 40
@@ -35,6 +36,9 @@ USUAL_COUNT = 200_000
 ROUNDS, BEST = 2, 20
 """So often the best views, so many in the same proportion, get others beside them, and half as many Gaussians that none of them
 shows well get places around them."""
+OWN_VIEWS = DEFAULT_HOLDOUT  # Views of each thing, if there are several: one of them decides
+OWN_PLACES, OWN_DISTANCE = 24, 2.3  # Places around a thing, so many half sides of its box away that it fills the frame
+INNER_PLACES, INNER_SHARE = 8, 0.5  # Places inside what lies around others, so many half sides from its middle
 DIRECTIONS = 192
 NEAR_PLANE = 0.1  # A near plane up to this share of the usual distance leaves what is looked at
 Drawing = Callable[[dict[str, np.ndarray]], AbstractContextManager[Show]]
@@ -91,8 +95,11 @@ def automatic_rig(
             stage.add_missing(round(BEST * share / 2))
             for view in stage.choose(round(BEST * share)):
                 stage.add_beside(view)
-    least = min(max(LEAST_VIEWS, PIXELS * source.count // (width * height)), MOST_VIEWS)
-    chosen = stage.in_order(stage.choose(views, least)) or [_blind(scene)] * (views or LEAST_VIEWS)
+        least = min(max(LEAST_VIEWS, PIXELS * source.count // (width * height)), MOST_VIEWS)
+        chosen = stage.in_order(stage.choose(views, least)) or [_blind(scene)] * (views or LEAST_VIEWS)
+        if views is None:
+            numbers = range(len(scene.things))[: MOST_VIEWS // OWN_VIEWS]
+            chosen = _joined([chosen, *(_own_views(scene, number, stage) for number in numbers)])
     forward = np.array([view.line for view in chosen]).T
     at = np.array([view.at for view in chosen]).T
     seen = stage.views or chosen
@@ -108,6 +115,32 @@ def automatic_rig(
     seldom = round(stage.seldom * source.count)
     hidden = f"; {seldom} Gaussians show only from behind, from below or through others" if seldom else ""
     return Rig(cameras, near, f"{_placed(scene, at)}{hidden}; {found.note}")
+
+
+def _own_views(scene: SceneSample, number: int, stage: Stage) -> list[Candidate]:
+    """Views of a thing from near by, and from inside if it lies around others. The first is to decide."""
+    box, others = scene.things[number], scene.things[:number] + scene.things[number + 1 :]
+    own = ThingStage(
+        replace(scene, stands=np.where(scene.thing == number, scene.stands, 0.0)), stage.show, stage.frames, stage.lens
+    )
+    away = OWN_DISTANCE * float(box.half.max())
+    for line in fibonacci(OWN_PLACES):
+        own.add_view(box.middle - away * line, line, away)
+    if any((np.abs(other.middle - box.middle) < box.half).all() for other in others):
+        for line in fibonacci(INNER_PLACES):
+            own.add_place(box.middle + INNER_SHARE * box.half * line, float(box.half.min()))
+    for view in own.choose(OWN_VIEWS):
+        own.add_beside(view)
+    return own.in_order(own.choose(OWN_VIEWS))
+
+
+def _joined(groups: list[list[Candidate]]) -> list[Candidate]:
+    """Groups of views as one, in which every `DEFAULT_HOLDOUT`-th view is such a one of a group."""
+    first = iter([view for group in groups for view in group[::DEFAULT_HOLDOUT]])
+    rest = iter([view for group in groups for place, view in enumerate(group) if place % DEFAULT_HOLDOUT])
+    count = sum(map(len, groups))
+    turns = ((rest, first) if place % DEFAULT_HOLDOUT else (first, rest) for place in range(count))
+    return [next(one, None) or next(other) for one, other in turns]
 
 
 def _blind(scene: SceneSample) -> Candidate:

@@ -75,6 +75,7 @@ class Candidate:
     blur: float
     filled: float
     distance: float
+    own: float = 1.0  # share of its light that comes from what is to be seen
 
 
 class Stage:
@@ -82,7 +83,7 @@ class Stage:
 
     def __init__(self, scene: SceneSample, show: Show, frames: Frames, lens: float) -> None:
         self.scene, self.frames = scene, frames
-        self._show, self._focal = show, SIDE * lens
+        self.show, self.lens, self._focal = show, lens, SIDE * lens
         self.views: list[Candidate] = []
         self._most = np.zeros(scene.sizes.size)
         """The largest part of each Gaussian that any view shows, scene units squared."""
@@ -132,15 +133,18 @@ class Stage:
             row = missing[place * missing.size // len(directions)]
             for line, times in zip(lines, LOOKED_AT):
                 distance = times * float(scene.sizes[row])
-                eye = scene.means[:, row] - line * distance
-                self._draw(eye, line, distance, filled_share(bins_of(_lines(scene.means, eye)[0])))
+                self.add_view(scene.means[:, row] - line * distance, line, distance)
+
+    def add_view(self, eye: np.ndarray, line: np.ndarray, step: float) -> None:
+        """Draw the view from a place ([3]) in a direction ([3])."""
+        self._draw(eye, line, step, filled_share(bins_of(_lines(self.scene.means, eye)[0])))
 
     def _draw(self, eye: np.ndarray, line: np.ndarray, step: float, sides: float) -> None:
         scene, half = self.scene, (SIDE - 1) / 2
         if float(np.abs(eye).max()) > FARTHEST * scene.unit:
             return
         camera = look("small", eye / scene.unit, line, np.array([0.0, -1.0, 0.0]), SIDE, SIDE, self._focal)
-        rows, weights = self._show(replace(camera, cx=half, cy=half))
+        rows, weights = self.show(replace(camera, cx=half, cy=half))
         if not rows.size:
             return
         light = np.rint(weights * LOGS)
@@ -164,7 +168,7 @@ class Stage:
         self.views.append(
             Candidate(
                 eye, line, step, sides, rows, part, _close(angles), clear * self._told(eye, rows, part), smear, blur, filled,
-                math.exp(usual / LOGS),
+                math.exp(usual / LOGS), float(light[scene.stands[rows] > 0].sum()) / total,
             )
         )  # fmt: skip
 
@@ -289,6 +293,15 @@ class Stage:
             held[chosen[best].rows] += shares[best]
         last, first = iter(between), iter([turn for turn in range(len(chosen)) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(len(chosen))]
+
+
+class ThingStage(Stage):
+    """Candidates for views of one thing: Gaussians of others stand for none."""
+
+    def _worth(self) -> np.ndarray:
+        self.last = np.zeros(len(self.views), bool)
+        worth = np.array([view.clear * view.own for view in self.views])
+        return np.rint(UNITS * worth / max(float(worth.max()), 1e-300)) / UNITS
 
 
 def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

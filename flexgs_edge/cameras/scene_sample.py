@@ -12,14 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
-from flexgs_edge.cameras.detail import few_rows, smears
+from flexgs_edge.cameras.detail import few_rows, smears, things
 from flexgs_edge.constants import SH_C1, SH_C2, SH_C3
 from flexgs_edge.small_matrices import rotation_matrix
 
 SAMPLE_ROWS = 1 << 15  # Rows for parts and ground
 READ_ROWS = 1 << 23  # Most rows that are compared with those around them. Of more, every k-th is.
 CHUNK_ROWS = 1 << 18  # Rows that are read together
-DRAWN_ROWS = 1 << 15  # Rows that are drawn, about; see `drawn_rows`
+DRAWN_ROWS = 1 << 15  # Rows that are drawn, about
+THING_ROWS = 1 << 10  # About so many rows of a thing are drawn at least, if there are several and it has as many
 TELLING_ROWS = 1200  # Rows whose SH tell directions
 BOX_REACH = 20.0  # Beyond so many half sides of the box of the first part, nothing is told apart
 BULK = (0.05, 0.95)  # Quantiles of the positions for the middle and the box of a part
@@ -94,6 +95,8 @@ class SceneSample:
     sizes: np.ndarray  # [M] f64, geometric mean of the two largest deviations, before they grew to stand for others
     smear: np.ndarray  # [M] f64, see `smears`
     stands: np.ndarray  # [M] f64, for how many rows of the scene each stands
+    thing: np.ndarray  # [M] int64, the number of the thing that each is of, see `things`
+    things: list[Part]  # Boxes of the things, if there are several
     telling: np.ndarray  # [T] int64, those of them whose SH tell from where they were trained
     sh: np.ndarray  # [3, K, T] f64, coefficients of degrees 1 to 3 over their root mean square over all directions
     share: float  # Share of the rows that tell directions
@@ -126,11 +129,17 @@ def sample_scene(source: Gaussians) -> SceneSample:
     reach = BOX_REACH * float(parts[0].half.max())
     smear, place = smears(means, sizes, parts[0].middle - reach, 2 * reach)
     areas = opacity * sizes * sizes
-    drawn, growth = few_rows(areas, DRAWN_ROWS)
+    thing = things(means, sizes * math.sqrt(step), parts[0].middle)
+    drawn, growth = _few_of_each(areas, thing)
     # Views leave out blocks of rows that lie beside them.
     order = np.argsort(place[drawn])
     drawn, growth = drawn[order], growth[order]
-    unit = min(part.extent for part in parts)
+    boxes = []
+    for number in range(int(thing.max()) + 1 if thing.max() > 0 else 0):
+        own = thing[drawn] == number
+        some = drawn[own]
+        boxes.append(part_of(means[:, some].astype(np.float64), sizes[some], opacity[some] * growth[own] ** 2))
+    unit = min(part.extent for part in (*parts, *boxes))
     planes = source.read(drawn * step, ["means", "opacity_logits", "log_scales", "quats"])
     logs = _logs(planes) + np.log(growth * (math.sqrt(step) / unit))
     peak = float(_opacities(planes).max())
@@ -153,10 +162,26 @@ def sample_scene(source: Gaussians) -> SceneSample:
         sizes=sizes[drawn],
         smear=smear[drawn],
         stands=step * growth * growth,
+        thing=thing[drawn],
+        things=boxes,
         telling=telling,
         sh=sh,
         share=share,
     )
+
+
+def _few_of_each(areas: np.ndarray, thing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`few_rows` of each thing by itself, so that none is left out; crumbs go with the first."""
+    if thing.max() <= 0:
+        return few_rows(areas, DRAWN_ROWS)
+    found = []
+    for number in range(int(thing.max()) + 1):
+        own = np.flatnonzero(thing == number if number else thing <= 0)
+        rows, growth = few_rows(areas[own], max(DRAWN_ROWS * own.size // areas.size, THING_ROWS))
+        found.append((own[rows], growth))
+    rows, growth = (np.concatenate(values) for values in zip(*found))
+    order = np.argsort(rows)
+    return rows[order], growth[order]
 
 
 def _logs(planes: dict[str, np.ndarray]) -> np.ndarray:
