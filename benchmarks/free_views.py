@@ -128,6 +128,11 @@ SCENES: dict[str, Callable[[], list[Part]]] = {
     "under glass": lambda: [Part((0, 0, 0), 1.0, 1500, 0.8, -3.0), Part((0, 0, 0), 0.3, 400, 0.3)],
     "lattice": lambda: [Part((3.0 * x, 3.0 * y, 3.0 * z), 0.4, 150) for x in range(3) for y in range(3) for z in range(3)],
     "ring": lambda: _ring(12, 8.0, 0.4),
+    "joined rooms": lambda: [
+        *(Part((x, 0, 0), 2.0, 8000, inside=True) for x in (-1.95, 1.95)), Part((2.0, 1.75, 0), 0.3, 250),
+    ],
+    "joined balls": lambda: [Part((1.9 * k, 0, 0), 1.0, 2000, inside=True) for k in range(5)],
+    "shell": lambda: [Part((0, 0, 0), 3.0, 40_000, inside=True)],
 }  # fmt: skip
 
 

@@ -39,6 +39,7 @@ shows well get places around them."""
 OWN_VIEWS = DEFAULT_HOLDOUT  # Views of each thing, if there are several: one of them decides
 OWN_PLACES, OWN_DISTANCE = 24, 2.3  # Places around a thing, so many half sides of its box away that it fills the frame
 INNER_PLACES, INNER_SHARE = 8, 0.5  # Places inside what lies around others, so many half sides from its middle
+CLOSE_UP_VIEWS = 16  # At most so many views tell whether what all others show small looks right from near by
 DIRECTIONS = 192
 NEAR_PLANE = 0.1  # A near plane up to this share of the usual distance leaves what is looked at
 Drawing = Callable[[dict[str, np.ndarray]], AbstractContextManager[Show]]
@@ -55,6 +56,15 @@ SPARSE = 0.5  # A scene is sparse if all its cross-sections together are less th
 
 
 @dataclass(frozen=True)
+class CloseUp:
+    """A view that is no camera of the rig, and shows some Gaussians much larger than all of these do."""
+
+    camera: Camera
+    place: tuple[float, float, float]  # what it looks at, world coordinates
+    count: int  # so many Gaussians, about
+
+
+@dataclass(frozen=True)
 class Rig:
     """Automatic cameras."""
 
@@ -63,6 +73,7 @@ class Rig:
     cameras: list[Camera]
     near: float  # Scene units: a larger near plane would cut off what the views show
     note: str  # How the cameras were placed, for the summary
+    close_ups: tuple[CloseUp, ...] = ()  # what shows much larger elsewhere than in the cameras
 
 
 def automatic_rig(
@@ -100,9 +111,10 @@ def automatic_rig(
         if views is None:
             numbers = range(len(scene.things))[: MOST_VIEWS // OWN_VIEWS]
             chosen = _joined([chosen, *(_own_views(scene, number, stage) for number in numbers)])
+        seen = list(stage.views) or chosen
+        ups = stage.close_ups(chosen, CLOSE_UP_VIEWS) if stage.views and views is None else []
     forward = np.array([view.line for view in chosen]).T
     at = np.array([view.at for view in chosen]).T
-    seen = stage.views or chosen
     stands = Stands(
         np.array([view.at for view in seen]).T, stage.strength if stage.views else np.ones(len(seen)), forward
     )
@@ -111,10 +123,18 @@ def automatic_rig(
         look(f"auto_{index:03d}", view.at + source.origin, view.line, found.direction, width, height, focal)
         for index, view in enumerate(chosen)
     ]
+    close_ups = tuple(
+        CloseUp(
+            look(f"near_{index}", view.at + source.origin, view.line, found.direction, width, height, focal),
+            tuple((view.at + view.line * view.distance + source.origin).tolist()),
+            count,
+        )
+        for index, (view, count) in enumerate(ups)
+    )
     near = float(f"{NEAR_PLANE * min(view.distance for view in chosen):.2g}")
     seldom = round(stage.seldom * source.count)
     hidden = f"; {seldom} Gaussians show only from behind, from below or through others" if seldom else ""
-    return Rig(cameras, near, f"{_placed(scene, at)}{hidden}; {found.note}")
+    return Rig(cameras, near, f"{_placed(scene, at)}{hidden}; {found.note}", close_ups)
 
 
 def _own_views(scene: SceneSample, number: int, stage: Stage) -> list[Candidate]:
@@ -124,11 +144,12 @@ def _own_views(scene: SceneSample, number: int, stage: Stage) -> list[Candidate]
         replace(scene, stands=np.where(scene.thing == number, scene.stands, 0.0)), stage.show, stage.frames, stage.lens
     )
     away = OWN_DISTANCE * float(box.half.max())
-    for line in fibonacci(OWN_PLACES):
-        own.add_view(box.middle - away * line, line, away)
     if any((np.abs(other.middle - box.middle) < box.half).all() for other in others):
         for line in fibonacci(INNER_PLACES):
             own.add_place(box.middle + INNER_SHARE * box.half * line, float(box.half.min()))
+    else:
+        for line in fibonacci(OWN_PLACES):
+            own.add_view(box.middle - away * line, line, away)
     for view in own.choose(OWN_VIEWS):
         own.add_beside(view)
     return own.in_order(own.choose(OWN_VIEWS))

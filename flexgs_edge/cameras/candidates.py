@@ -32,6 +32,8 @@ DECIDING = 0.3  # Views that are worth less than this share of the best do not d
 NEW, LEAST_NEW, NEW_SHARP = 0.5, 0.001, 0.3
 """Views that show at least the second share of the Gaussians, of which all others together show less than the first share of what
 can be shown of them, are taken however little they are worth, if they count so much for what is too wide in them."""
+HIDDEN = 0.1  # Less of a Gaussian than this share is next to nothing
+LARGER = 2.0  # Scored poses are half as far away as given ones, too: only what shows larger than in these is news
 BLURRED = 0.15
 """Usual deviation of a view's splats, radians, beyond which it shows a blur: matter right before the lens or all around it."""
 NEAR, NEAR_POWER = 0.3, 8
@@ -123,17 +125,12 @@ class Stage:
 
     def add_missing(self, count: int) -> None:
         """Draw views of `count` of the Gaussians that no view shows well, evenly spread over all of them."""
-        scene, best = self.scene, np.zeros(self.scene.sizes.size)
+        best = np.zeros(self.scene.sizes.size)
         for view, worth in zip(self.views, self._worth() if self.views else ()):
             if worth:
                 best[view.rows] = np.maximum(best[view.rows], view.close)
         missing = np.flatnonzero(best < _close(np.array([LEAST_ANGLE]))[0])
-        directions = fibonacci(len(LOOKED_AT) * min(count, missing.size)).reshape(-1, len(LOOKED_AT), 3)
-        for place, lines in enumerate(directions):
-            row = missing[place * missing.size // len(directions)]
-            for line, times in zip(lines, LOOKED_AT):
-                distance = times * float(scene.sizes[row])
-                self.add_view(scene.means[:, row] - line * distance, line, distance)
+        self._add_views_of(missing, count)
 
     def add_view(self, eye: np.ndarray, line: np.ndarray, step: float) -> None:
         """Draw the view from a place ([3]) in a direction ([3])."""
@@ -293,6 +290,54 @@ class Stage:
             held[chosen[best].rows] += shares[best]
         last, first = iter(between), iter([turn for turn in range(len(chosen)) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(len(chosen))]
+
+    def close_ups(self, chosen: list[Candidate], most: int) -> list[tuple[Candidate, int]]:
+        """At most `most` views in place that show Gaussians much larger than the chosen ones do, and how many.
+
+        Each next one adds most. A view shows a Gaussian if it shows half as much of it as any view or more.
+        """
+        self._add_hidden(chosen, most)
+        self._worth()
+        scene, seen = self.scene, np.zeros(self.scene.sizes.size)
+
+        def shown(view: Candidate) -> tuple[np.ndarray, np.ndarray]:
+            rows = view.rows[2 * view.part >= np.maximum(self._most[view.rows], 1e-300)]
+            return rows, scene.sizes[rows] / _lines(scene.means[:, rows], view.at)[1]
+
+        for rows, angles in map(shown, chosen):
+            seen[rows] = np.maximum(seen[rows], angles)
+        sharp = [view for view, last in zip(self.views, self.last) if last and math.exp(view.blur) < BLURRED]
+        shows, stands = list(map(shown, sharp)), np.rint(16 * scene.stands)
+        found: list[tuple[Candidate, int]] = []
+        bounds, least = np.full(len(sharp), np.inf), LEAST_NEW * float(stands.sum())
+        while len(found) < most and (bounds >= least).any():
+            best = int(np.argmax(bounds))
+            rows, angles = shows[best]
+            # What a view adds only falls, so what it added before is an upper bound.
+            bounds[best], before = float(stands[rows[angles > LARGER * seen[rows]]].sum()), bounds[best]
+            if bounds[best] == before:
+                seen[rows] = np.maximum(seen[rows], angles)
+                found.append((sharp[best], round(before / 16)))
+        return found
+
+    def _add_hidden(self, chosen: list[Candidate], count: int) -> None:
+        """Draw views of `count` of the Gaussians of which all chosen views together show next to nothing."""
+        scene, most = self.scene, np.zeros(self.scene.sizes.size)
+        for view in chosen:
+            most[view.rows] = np.maximum(most[view.rows], view.part)
+        opacity = 1 / (1 + np.exp(-scene.planes["opacity_logits"][0].astype(np.float64)))
+        whole = 2 * math.pi * opacity * scene.sizes**2 * scene.stands * self._focal**2
+        self._add_views_of(np.flatnonzero(most < HIDDEN * whole), count)
+
+    def _add_views_of(self, rows: np.ndarray, count: int) -> None:
+        """Draw views of `count` of some rows, evenly spread over all of them."""
+        scene = self.scene
+        directions = fibonacci(len(LOOKED_AT) * min(count, rows.size)).reshape(-1, len(LOOKED_AT), 3)
+        for place, lines in enumerate(directions):
+            row = rows[place * rows.size // len(directions)]
+            for line, times in zip(lines, LOOKED_AT):
+                distance = times * float(scene.sizes[row])
+                self.add_view(scene.means[:, row] - line * distance, line, distance)
 
 
 class ThingStage(Stage):

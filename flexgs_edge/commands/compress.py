@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from flexgs_edge.cameras.auto import CloseUp
 from flexgs_edge.codec.open_fgs import file_version
 from flexgs_edge.codec.v2.container import write_grid
 from flexgs_edge.goals.promise import in_the_way, kept_promise
@@ -46,6 +48,7 @@ ROWS_MOST = 400_000  # Most Gaussians of an original: more do not fit into that
 FIT_GAP = 2.0  # We warn of overfitting when training views show this much more fidelity than held-out views, dB
 NEEDED_VIEWS = 16  # We warn below this many scored views; more change little
 UNSEEN_SHARE = 0.01  # We warn when automatic views miss more than this share of the Gaussians
+NAMED = 4  # So many places are named in a warning
 ROW_BYTES = 59 * 4 * 4  # Memory that coding takes for a Gaussian: its values, their forms and codes
 
 
@@ -99,7 +102,7 @@ def _result(run: Run[CompressOptions], renderer: Renderer | None, made: MethodRe
     held_out = None
     if made.quality is not None and made.trained is not None:
         held_out = measurement_of(made.quality).figure("fidelity")
-    warnings = view_warnings(views, scored, run.scene.input_count, made.trained, held_out) if views else ()
+    warnings = view_warnings(views, scored, run.scene.input_count, made.trained, held_out, made.lost) if views else ()
     reached = search.reached if search and options.fixed is None else None
     warnings += _default_warnings(run, reached, search)
     had = scene_info(run.scene).bytes
@@ -213,13 +216,18 @@ def fine_steps(means: np.ndarray, log_scales: np.ndarray, sh_degree: int) -> Ste
 
 
 def view_warnings(
-    views: ViewSet, scored: Scored | None, count: int, trained: float | None, held_out: float | None
+    views: ViewSet,
+    scored: Scored | None,
+    count: int,
+    trained: float | None,
+    held_out: float | None,
+    lost: Sequence[CloseUp] = (),
 ) -> tuple[str, ...]:
     """Warnings of a run, as sentences for a person.
 
     `views`: all views of the run. `scored`: numbers of scored views and of unseen Gaussians; `None` if the search
     measured no costs. `count`: Gaussians of the scene. `trained`, `held_out`: mean fidelity on training views and on
-    held-out views, dB; `None` if not measured.
+    held-out views, dB; `None` if not measured. `lost`: what automatic views show small, and looks wrong from near by.
     """
     found = []
     if trained is not None and held_out is not None and trained - held_out > FIT_GAP:
@@ -238,5 +246,12 @@ def view_warnings(
             f"{scored.unseen} of {count} Gaussians ({100 * scored.unseen / count:.1f} %) appear in none of the {scored.poses} "
             "automatic views that were scored, so nothing checked how they look. Give the scene's cameras (--cameras PATH), or "
             "choose with --unseen what happens to them."
+        )
+    if lost:
+        named = [f"({', '.join(f'{value:.3g}' for value in each.place)})" for each in lost[:NAMED]]
+        more = f" and {len(lost) - NAMED} more places" if len(lost) > NAMED else ""
+        found.append(
+            f"About {sum(each.count for each in lost)} Gaussians around {', '.join(named)}{more} are shown by no view from near "
+            "by, and look wrong from there. Give cameras that walk up to them (--cameras PATH)."
         )
     return tuple(found)

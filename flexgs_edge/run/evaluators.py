@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
+from flexgs_edge.cameras.auto import CloseUp
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.goals.promise import MADE_GAP
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.packed.quantize import QuantizedScene
 from flexgs_edge.quality.view_quality import Quality
@@ -15,6 +17,9 @@ from flexgs_edge.run.few_poses import MOST, FewPoses, evenly, made_poses
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.source import SceneSource
+
+LEAST_NEAR = 30.0
+"""What views show small looks wrong from near by if it has less fidelity than this, dB, and `MADE_GAP` less than the rest."""
 
 
 class Evaluators(AbstractContextManager["Evaluators"]):
@@ -31,6 +36,8 @@ class Evaluators(AbstractContextManager["Evaluators"]):
         self.decide = self._judge(run.plan.decide, reports=False) if on_train else self.report
         self.training: FewPoses | None = None
         self._made: FewPoses | None = None
+        self._close_ups: FewPoses | None = None
+        self.lost: tuple[CloseUp, ...] = ()  # Views from near by of what was measured last that look wrong
         self.trained: float | None = None  # Fidelity of what was measured last on training poses, dB
 
     def _judge(self, indices: list[int], reports: bool) -> QualityEvaluator:
@@ -61,6 +68,8 @@ class Evaluators(AbstractContextManager["Evaluators"]):
                 if views.train and self._plan.report == views.held_out:
                     cameras = evenly(views.of(views.train), MOST)
                     self.training = self._few(device_scene, cameras)
+                if views.close_ups:
+                    self._close_ups = self._few(device_scene, [each.camera for each in views.close_ups])
                 if made is not None:
                     self.decide.made = self.report.made = self._made = self._few(device_scene, made)
             yield device_scene
@@ -93,6 +102,10 @@ class Evaluators(AbstractContextManager["Evaluators"]):
             if self.training is not None:
                 self.trained = self.training.quality(scene).deciding_fidelity
             quality = self.report.compare(scene, with_ssim=True, progress=run.progress, flip=True)
+            if self._close_ups is not None:
+                bound = min(LEAST_NEAR, (quality.deciding_fidelity or LEAST_NEAR) - MADE_GAP)
+                found = zip(run.seen.close_ups, self._close_ups.quality(scene).views, strict=True)
+                self.lost = tuple(each for each, view in found if (view.covered_fidelity or bound) < bound)
             if run.reporter is not None:
                 run.reporter.look(self.report, scene, quality, run.clock, run.progress)
         return quality
@@ -104,7 +117,7 @@ class Evaluators(AbstractContextManager["Evaluators"]):
 
     def close(self) -> None:
         """Remove what the original looked like from training poses and made ones."""
-        for few in (self.training, self._made):
+        for few in (self.training, self._made, self._close_ups):
             if few is not None:
                 few.close()
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from flexgs_edge._version import __version__
+from flexgs_edge.cameras.auto import CloseUp
 from flexgs_edge.cameras.start import START
 from flexgs_edge.codec.sections import canonical_json
 from flexgs_edge.goals.steps import Choice, SearchResult, Step
@@ -33,6 +34,7 @@ class MethodResult:
     search: SearchResult | None  # every step of the search; `None` for fixed rates
     quality: Quality | None  # quality of the decoded file over the report views; `None` without views
     trained: float | None  # fidelity of the decoded file on training views, dB; `None` if not measured
+    lost: tuple[CloseUp, ...] = ()  # what automatic views show small, and looks wrong from near by
     bits: BitSpec | None = None  # bits per attribute (`paper`)
     groups: Mapping[str, int] | None = None  # quantization groups per array (`paper`)
     step_sizes: StepSizes | None = None  # quantization step sizes (`best`)

@@ -312,7 +312,7 @@ def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:
             moved = [
                 replace(camera, translation=camera.translation + camera.rotation @ origin) for camera in views.cameras
             ]
-            views = replace(views, cameras=moved)
+            views = replace(views, cameras=moved, close_ups=())
         run = run.of_source(MovedSource(run.source, np.zeros(3)))
         run = replace(run, views=views, output=replace(run.output, offset=origin))
     warnings = check_positions(run.source, format, run.options.force_lossy)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexgs_edge.cameras.auto import automatic_rig
+from flexgs_edge.cameras.auto import CloseUp, automatic_rig
 from flexgs_edge.cameras.camera import Camera, distinct_names, limit_width, split_views
 from flexgs_edge.cameras.candidates import Show
 from flexgs_edge.cameras.photos import Photos
@@ -58,6 +58,7 @@ class ViewSet:
     # How automatic cameras were placed, and which views were scaled or lost their distortion.
     notes: tuple[str, ...] = ()
     near: float | None = None  # largest near plane that does not cut off what automatic views show, scene units
+    close_ups: tuple[CloseUp, ...] = ()  # what shows much larger elsewhere than in automatic views
     fits_exposure: bool = True  # photos are fitted to the exposure of the original before they are compared
 
     @property
@@ -175,7 +176,7 @@ def _automatic_views(options: ViewOptions, source: SceneSource, budget: MemoryBu
     cameras, note = limit_width(rig.cameras, options.resolution)
     notes = (rig.note,) if note is None else (rig.note, note)
     train, held_out = split_views(len(cameras), options.holdout)
-    return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, notes, rig.near)
+    return ViewSet(cameras, None, train, held_out, AUTO_CAMERAS, None, notes, rig.near, rig.close_ups)
 
 
 def _images(options: ViewOptions, companions: Companions, place: str | Path) -> Path | None:

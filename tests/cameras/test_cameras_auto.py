@@ -19,7 +19,7 @@ from flexgs_edge.cameras.candidates import Show, look
 from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
-from flexgs_edge.cameras.scene_sample import sh_basis, weighted_quantiles
+from flexgs_edge.cameras.scene_sample import sample_scene, sh_basis, weighted_quantiles
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.io.ply import PlySource
@@ -118,6 +118,37 @@ def test_an_object_in_a_room_is_seen_between_the_two() -> None:
     source = joined(ball(0.8, 2500), room(5.0))
     cameras, _ = placed(source, views=16, width=64, height=48)
     assert (np.linalg.norm(centres(cameras), axis=1) > 0.9).all() and (np.abs(centres(cameras)) < 4.9).all()
+
+
+def test_a_small_thing_apart_is_looked_at_from_near_by() -> None:
+    """Eight views of it on top, and one of them decides. What touches all else gets none."""
+    centre = np.array([6.0, 0.0, 0.0])
+    rig = automatic_rig(joined(ball(2.0, 3000), ball(0.05, 300, (6.0, 0.0, 0.0))), drawing())
+    away = centre - centres(rig.cameras)
+    distance = np.linalg.norm(away, axis=1)
+    near = (distance < 0.3) & (np.einsum("vx,vx->v", forwards(rig.cameras), away) > 0.9 * distance)
+    assert near.sum() >= 8 and near[split_views(len(rig.cameras))[1]].any()
+    assert not sample_scene(joined(ball(2.0, 3000), ball(0.4, 100, (2.0, 0.0, 0.0)))).things
+
+
+def test_what_lies_around_another_is_seen_from_inside() -> None:
+    source = joined(room(5.0), ball(0.2, 300, (1.0, 1.0, 0.0)))
+    cameras = automatic_rig(source, drawing()).cameras
+    away = np.linalg.norm(centres(cameras) - [1.0, 1.0, 0.0], axis=1)
+    assert (away < 1.0).sum() >= 8 and (np.abs(centres(cameras)) < 4.9).all(axis=1).mean() > 0.7
+
+
+def test_what_no_view_shows_well_has_close_ups() -> None:
+    """A shell that is seen from outside, and a ball in it that touches it."""
+    shell = fibonacci(6000)
+    inner = fibonacci(250) * 0.3 + [0.0, 1.75, 0.0]
+    source = make_splats(np.concatenate([2 * shell, inner]), np.full((6250, 3), 0.05), opacity=0.95)
+    rig = automatic_rig(source, drawing())
+    assert all(each.count >= 6 for each in rig.close_ups)
+    places = np.array([each.place for each in rig.close_ups])
+    eyes = centres([each.camera for each in rig.close_ups])
+    assert np.linalg.norm(places - [0.0, 1.75, 0.0], axis=1).min() < 0.5
+    assert (np.linalg.norm(eyes, axis=1) < 2).any()
 
 
 @pytest.mark.parametrize("kind", ["object", "room", "both"])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from flexgs_edge.cameras.detail import UNITS, WIDEST, few_rows, smears
+from flexgs_edge.cameras.detail import CRUMB_ROWS, UNITS, WIDEST, few_rows, smears, things
 from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
 from flexgs_edge.cameras.scene_sample import DRAWN_ROWS, find_parts, sample_scene
 from synthetic import make_splats
@@ -32,6 +32,34 @@ def test_what_is_wider_than_those_around_it_is_smeared() -> None:
     # Neither the place nor the unit matter.
     moved, _ = smears(means * 1e3 + 5e3, sizes * 1e3, np.array([-295e3] * 3), 600e3)
     np.testing.assert_allclose(moved[[0, -2, -1]], logs[[0, -2, -1]], atol=0.1 * UNITS)
+
+
+def test_what_touches_nothing_of_its_size_is_a_thing() -> None:
+    """A ball, one of its size apart from it, and a fine one right in it: three things, and a few crumbs."""
+    means = np.concatenate(
+        [ball(), ball(500) + np.array([4, 0, 0]), ball(400) * 0.05 + [[0, 1.0, 0]], ball(20) * 0.1 + [[0, 9, 0]]]
+    ).T
+    sizes = np.concatenate([np.full(3000, 0.1), np.full(500, 0.1), np.full(400, 0.005), np.full(20, 0.1)])
+    found = things(means, sizes, np.zeros(3))
+    assert (found == np.repeat([0, 1, 2, -1], [3000, 500, 400, 20])).all()
+    # Neither the order, the unit nor the place matter.
+    order = np.random.default_rng(0).permutation(sizes.size)
+    assert (things(means[:, order], sizes[order], np.zeros(3)) == found[order]).all()
+    assert (things(means * 1024 - 7e4, sizes * 1024, np.array([3e5, 0.0, 1.0])) == found).all()
+    # Sizes that follow each other hold the fine ball and the coarse one together.
+    chain = np.geomspace(0.005, 0.1, 60)
+    joined = np.concatenate([means, np.stack([0 * chain, np.linspace(1.0, 0.9, 60), 0 * chain])], axis=1)
+    assert (things(joined, np.concatenate([sizes, chain]), np.zeros(3))[3500:3900] == 0).all()
+
+
+def test_a_long_row_is_one_thing_and_single_ones_are_none() -> None:
+    along = np.stack([np.arange(5000.0), np.zeros(5000), np.zeros(5000)])
+    row = np.random.default_rng(0).permutation(5000)
+    assert (things(along[:, row], np.full(5000, 0.3), np.zeros(3)) == 0).all()
+    assert (things(along[:, row], np.full(5000, 0.03), np.zeros(3)) == -1).all()
+    assert (things(along[:, :CRUMB_ROWS], np.full(CRUMB_ROWS, 0.3), np.zeros(3)) == 0).all()
+    # The ends of float32 do not fail.
+    assert things(np.array([[3e38, -3e38, 0.0]] * 3), np.array([1e-17, 1e17, 1.0]), np.zeros(3)).tolist() == [-1] * 3
 
 
 def test_few_rows_cover_as_much_as_all() -> None:

@@ -105,6 +105,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
             search=search,
             quality=quality,
             trained=judges.trained,
+            lost=judges.lost,
             step_sizes=grid.step_sizes,
             preview_bytes=len(preview),
         )

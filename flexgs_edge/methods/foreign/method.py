@@ -63,6 +63,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
             search=search,
             quality=quality,
             trained=judges.trained,
+            lost=judges.lost,
         )
 
 

@@ -232,6 +232,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
             search=search,
             quality=quality,
             trained=None if judges is None else judges.trained,
+            lost=() if judges is None else judges.lost,
             bits=quantized.bits,
             groups={name: array.groups for name, array in quantized.arrays.items()},
             scores_reused=reused,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexgs_edge.cameras.auto import CloseUp
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import at_distance, between
 from flexgs_edge.cameras.read import read_cameras
@@ -268,6 +269,17 @@ def test_warnings(
     assert len(found) == len(words)
     for text, wanted in zip(found, words):
         assert re.search(wanted, text), text
+
+
+def test_places_that_look_wrong_from_near_by_are_named() -> None:
+    camera = make_camera(40, 30)
+    lost = [CloseUp(camera, (1.0, -2.5, 0.12345 + place), 30) for place in range(6)]
+    (found,) = view_warnings(ViewSet([], None, [], [], "auto", None), None, 1000, None, None, lost)
+    assert (
+        found.startswith("About 180 Gaussians around (1, -2.5, 0.123), (1, -2.5, 1.12),") and "2 more places" in found
+    )
+    (found,) = view_warnings(ViewSet([], None, [], [], "auto", None), None, 1000, None, None, lost[:1])
+    assert found.startswith("About 30 Gaussians around (1, -2.5, 0.123) are shown by no view from near by")
 
 
 def test_warnings_are_told(project: Path, plain: CompressResult) -> None:
