@@ -18,7 +18,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.candidates import MOST_VIEWS, Candidate, Show, Stage, ThingStage, look
-from flexgs_edge.cameras.directions import Frames, fibonacci
+from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
 from flexgs_edge.cameras.scene_sample import Gaussians, Part, SceneSample, sample_scene
 from flexgs_edge.cameras.up import Stands, find_up, given_up
 from flexgs_edge.constants import DEFAULT_HOLDOUT
@@ -38,6 +38,7 @@ ROUNDS, BEST = 2, 20
 shows well get places around them."""
 OWN_VIEWS = DEFAULT_HOLDOUT  # Views of each thing, if there are several: one of them decides
 OWN_PLACES, OWN_DISTANCE = 24, 2.3  # Places around a thing, so many half sides of its box away that it fills the frame
+AROUND = 0.5  # A thing lies around another if it is there on more than this share of all sides
 INNER_PLACES, INNER_SHARE = 8, 0.5  # Places inside what lies around others, so many half sides from its middle
 CLOSE_UP_VIEWS = 16  # At most so many views tell whether what all others show small looks right from near by
 DIRECTIONS = 192
@@ -144,7 +145,8 @@ def _own_views(scene: SceneSample, number: int, stage: Stage) -> list[Candidate]
         replace(scene, stands=np.where(scene.thing == number, scene.stands, 0.0)), stage.show, stage.frames, stage.lens
     )
     away = OWN_DISTANCE * float(box.half.max())
-    if any((np.abs(other.middle - box.middle) < box.half).all() for other in others):
+    rows = scene.means[:, scene.thing == number]
+    if any(filled_share(bins_of(rows - other.middle[:, None])) > AROUND for other in others):
         for line in fibonacci(INNER_PLACES):
             own.add_place(box.middle + INNER_SHARE * box.half * line, float(box.half.min()))
     else:
