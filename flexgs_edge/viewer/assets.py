@@ -25,6 +25,7 @@ CROP = tuple(f"viewer/src/{name}.js" for name in ("crop", "in-picture", "styled"
 """The module that a page loads when somebody opens what lies under "More", and those that it imports."""
 _FORMATS = "decoder/src/formats.js"
 _FORMATS_2 = "decoder/src/formats2.js"
+_SHORT = "-short.js"  # So end the names of modules that pages of version 2 have in the place of longer ones
 _PATTERNS = ("viewer/*.html", "viewer/*.css", "viewer/src/*.js", "decoder/src/*.js")
 
 
@@ -52,8 +53,10 @@ def web_files(version: int = 1, kind: str = PLAIN, notes: bool = False) -> dict[
     places = [place for pattern in _PATTERNS for place in sorted(folder.glob(pattern))]
     files = {place.relative_to(folder).as_posix(): place.read_text(encoding="utf-8") for place in places}
     only_2 = files.pop(_FORMATS_2)
+    short = {path: files.pop(path) for path in list(files) if path.endswith(_SHORT)}
     if version == 2:
         files[_FORMATS] = only_2
+        files.update({path.replace(_SHORT, ".js"): text for path, text in short.items()})
     without = files.pop(_NO_NOTES)
     if not notes:
         files[_NOTES] = without

@@ -155,6 +155,74 @@ def test_damaged_files_are_refused_with_the_same_words(node: str, tmp_path: Path
     assert record["files"] >= DAMAGED and record["seconds"] < SLOW
 
 
+HEADERS = """
+import { isDeepStrictEqual } from 'node:util';
+import { readFileSync } from 'node:fs';
+const [long, short] = await Promise.all(process.argv.slice(1, 3).map((path) => import(path)));
+const read = (decoder, text) => {
+  try {
+    return decoder.decodeHeader2(new TextEncoder().encode(text));
+  } catch (error) {
+    return error.constructor.name === 'HeaderError' ? null : error;
+  }
+};
+const found = JSON.parse(readFileSync(0, 'utf8')).map((text) => [read(long, text), read(short, text)]);
+console.log(JSON.stringify(found.map(([one, two]) => [one !== null, isDeepStrictEqual(one, two)])));
+"""
+ODD = ["null", "true", "-1", "0", "3", "4", "0.5", "1.5", "1e300", "1e999", "NaN", "2097152", '"3"', "[]", "[0]", "{}"]
+
+
+def odd_headers(header: dict[str, Any]) -> Iterable[str]:
+    """The header, and with each value replaced, each key left out, and a further key; also those of objects and lists in it."""
+    yield json.dumps(header)
+    for path in places(header):
+        for value in ODD:
+            if not (path[0] in {"origin", "steps"} and value.lstrip("-").isdigit()):
+                yield changed(header, path, "@").replace('"@"', value)
+        yield changed(header, path, None)
+        yield changed(header, (*path[:-1], "further"), 1)
+    yield from ("", "[]", "null", "3", "{", '{"é": 1}')
+
+
+def places(value: Any) -> Iterable[tuple[Any, ...]]:
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in pairs:
+        yield (key,)
+        if key != "settings":
+            yield from ((key, *path) for path in places(inner))
+
+
+def changed(header: dict[str, Any], path: tuple[Any, ...], value: Any) -> str:
+    copy = json.loads(json.dumps(header))
+    inner = copy
+    for key in path[:-1]:
+        inner = inner[key]
+    if isinstance(inner, list) and path[-1] == "further":
+        inner.append(value)
+    elif value is None:
+        del inner[path[-1]]
+    else:
+        inner[path[-1]] = value
+    return json.dumps(copy)
+
+
+@pytest.mark.parametrize(
+    "name", ["contracted", "a_preview_before_chunks_of_256_rows", "degree_4_SH_beyond_the_limit_of_a_sum"]
+)
+def test_pages_refuse_the_same_headers(node: str, name: str) -> None:
+    """But for integers in the place of other numbers, which say the same."""
+    data = (FOLDER / f"{name}.fgs").read_bytes()
+    header = json.loads(data[36 : 36 + int.from_bytes(data[24:28], "little")])
+    header |= {"cut_from": {"bytes": 5, "count": 6, "layers": 7}}
+    texts = list(odd_headers(header))
+    modules = [str(DECODER / "src" / file) for file in ("header2.js", "header2-short.js")]
+    command = [node, "--input-type=module", "-e", HEADERS, *modules]
+    result = subprocess.run(command, input=json.dumps(texts), capture_output=True, text=True, check=True, timeout=60)
+    record = json.loads(result.stdout)
+    assert record[0] == [True, True] and sum(not taken for taken, _ in record) > len(texts) // 2
+    assert [text for text, (_, same) in zip(texts, record, strict=True) if not same] == []
+
+
 def test_nothing_large_is_made_on_a_files_word(node: str, tmp_path: Path) -> None:
     """A file that is refused gets no array of more than four times its size, others none larger than what they hold."""
     write_damaged(tmp_path)

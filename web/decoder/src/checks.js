@@ -1,4 +1,6 @@
 import { HeaderError } from './errors.js';
+import { plain } from './json.js';
+import { LARGEST } from './limits.js';
 import { shown } from './shown.js';
 
 /** An integer of a header within its bounds, as a number. */
@@ -31,4 +33,17 @@ export function hasKeys(value, keys) {
   if (!(value instanceof Map)) return false;
   const found = [...value.keys()].sort();
   return found.length === keys.length && keys.every((key, i) => key === found[i]);
+}
+
+/** Check the contraction of a header. */
+export function checkedContraction(value) {
+  if (hasKeys(value, ['centre', 'radius']) && Array.isArray(value.get('centre'))) {
+    const numbers = [...value.get('centre'), value.get('radius')];
+    const known = numbers.length === 4 && numbers.every((number) => isFloat(number) && Math.abs(number) <= LARGEST);
+    if (known && value.get('radius') >= 1 / LARGEST) return plain(value);
+  }
+  throw new HeaderError(
+    'contraction: wanted an object with centre (three numbers with a decimal point, within +-2^126) and radius (2^-126 to ' +
+      `2^126), got ${shown(value)}`,
+  );
 }

@@ -1,10 +1,10 @@
 import { Room, readChannel } from './channels.js';
 import { ShortStream, StreamError } from './errors.js';
-import { leastBytes } from './header2.js';
 import { CODE_LIMIT, VALUE_LIMIT } from './limits.js';
 import { BASE } from './model.js';
 import { readCells } from './octree.js';
 import { planPasses } from './passes.js';
+import { leastBytes } from './plan2.js';
 import { Decoder, laneCount } from './rans.js';
 import { addFeature, addSizes, addTriple, addWithSize, fillSums, startSums } from './sums.js';
 

@@ -1,24 +1,7 @@
 // Scene contraction: docs/format.md. Operations are those of the program, in doubles.
-import { hasKeys, isFloat } from './checks.js';
-import { HeaderError } from './errors.js';
-import { plain } from './json.js';
-import { shown } from './shown.js';
+import { LARGEST } from './limits.js';
 
 const OCTAVES = 64;
-const LARGEST = 2 ** 126;
-
-/** Check the contraction of a header. */
-export function checkedContraction(value) {
-  if (hasKeys(value, ['centre', 'radius']) && Array.isArray(value.get('centre'))) {
-    const numbers = [...value.get('centre'), value.get('radius')];
-    const known = numbers.length === 4 && numbers.every((number) => isFloat(number) && Math.abs(number) <= LARGEST);
-    if (known && value.get('radius') >= 1 / LARGEST) return plain(value);
-  }
-  throw new HeaderError(
-    'contraction: wanted an object with centre (three numbers with a decimal point, within +-2^126) and radius (2^-126 to ' +
-      `2^126), got ${shown(value)}`,
-  );
-}
 
 /** How many times as far away as in the grid a position is, from its distance there in radii. */
 function growth(distance) {

@@ -13,3 +13,5 @@ export const DEPTH_MOST = 21;
 export const CODE_LIMIT = 1 << 24;
 /** Largest magnitude of a value in predictions. */
 export const VALUE_LIMIT = 16383;
+/** Largest magnitude of a contraction's numbers, and of what it expands to. */
+export const LARGEST = 2 ** 126;

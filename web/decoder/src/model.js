@@ -1,6 +1,6 @@
 import { i16, i32, u16 } from './bytes.js';
 import { StreamError } from './errors.js';
-import { shownBytes } from './shown.js';
+import { shownBytes } from './shown-bytes.js';
 import { decodeTables } from './tables.js';
 
 const SCALES = ['scale x', 'scale y', 'scale z'];

@@ -2,7 +2,7 @@ import { crc32, hex8, u16, u32, u64 } from './bytes.js';
 import { FgsError } from './errors.js';
 import { FORMATS } from './formats.js';
 import { HEADER_MOST, MAGIC, PREAMBLE_BYTES } from './limits.js';
-import { shownBytes } from './shown.js';
+import { shownBytes } from './shown-bytes.js';
 
 /**
  * Read and check the preamble.

@@ -1,4 +1,5 @@
 // Values in messages, written as the program (Python) writes them, so that both say the same words.
+import { ESCAPES, hex } from './shown-bytes.js';
 
 const MOST = 80;
 
@@ -40,8 +41,6 @@ export function shownFloat(value) {
   return `${sign}${whole.slice(0, exponent + 1)}.${whole.slice(exponent + 1) || '0'}`;
 }
 
-const ESCAPES = { 9: '\\t', 10: '\\n', 13: '\\r', 92: '\\\\' };
-
 function reprText(text) {
   const quote = text.includes("'") && !text.includes('"') ? '"' : "'";
   let out = quote;
@@ -54,21 +53,4 @@ function reprText(text) {
     else out += letter;
   }
   return out + quote;
-}
-
-/** Bytes for a message. */
-export function shownBytes(bytes) {
-  const quote = bytes.includes(39) && !bytes.includes(34) ? '"' : "'";
-  let out = `b${quote}`;
-  for (const byte of bytes) {
-    if (byte === quote.charCodeAt(0)) out += `\\${quote}`;
-    else if (ESCAPES[byte]) out += ESCAPES[byte];
-    else if (byte < 32 || byte > 126) out += `\\x${hex(byte, 2)}`;
-    else out += String.fromCharCode(byte);
-  }
-  return out + quote;
-}
-
-function hex(number, digits) {
-  return number.toString(16).padStart(digits, '0');
 }

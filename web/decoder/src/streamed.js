@@ -2,9 +2,9 @@ import { crc32 } from './bytes.js';
 import { ShortStream, StreamError } from './errors.js';
 import { FgsFile } from './file.js';
 import { readFrame, readHeader, sharedPart } from './frame.js';
-import { leastBytes } from './header2.js';
 import { PREAMBLE_BYTES } from './limits.js';
 import { checkedChunk, chunkError, decodePlace, readTable } from './parts.js';
+import { leastBytes } from './plan2.js';
 import { compareCrc, readPreamble, truncated, wrongSize } from './preamble.js';
 
 /** Bytes that a first try waits for, as a share of those that a chunk will likely have. */

@@ -1,7 +1,7 @@
 // Version 1: bit-packed planes of codes, each a step between two ends of a group.
 
-import { checkedInteger, checkedOrigin, hasKeys } from './checks.js';
-import { checkedContraction, expand } from './contraction.js';
+import { checkedContraction, checkedInteger, checkedOrigin, hasKeys } from './checks.js';
+import { expand } from './contraction.js';
 import { FgsError, HeaderError } from './errors.js';
 import { parseJson, plain } from './json.js';
 import { CHUNK_ROWS, COUNT_MOST, DEGREE_MOST, PREAMBLE_BYTES } from './limits.js';

@@ -2,8 +2,9 @@
 
 import { decodeChunk } from './chunk.js';
 import { FgsError, StreamError } from './errors.js';
-import { decodeHeader2, leastBytes, planChunks2, wrongSize2 } from './header2.js';
+import { decodeHeader2 } from './header2.js';
 import { readModel } from './model.js';
+import { leastBytes, planChunks2, wrongSize2 } from './plan2.js';
 import { values2 } from './values.js';
 
 /** What `formats.js` asks of a version. */
