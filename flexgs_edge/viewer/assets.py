@@ -20,6 +20,7 @@ _KINDS = {
     SPATIAL: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
 }  # Of each kind, the worker that loads, and the module with the viewer
+_WORKERS, _OWN_WORKERS = "viewer/src/workers.js", "viewer/src/own-workers.js"
 _NOTES, _NO_NOTES = "viewer/src/notes.js", "viewer/src/no-notes.js"
 CROP = tuple(f"viewer/src/{name}.js" for name in ("crop", "in-picture", "styled", "vectors"))
 """The module that a page loads when somebody opens what lies under "More", and those that it imports."""
@@ -57,6 +58,7 @@ def web_files(version: int = 1, kind: str = PLAIN, notes: bool = False) -> dict[
     if version == 2:
         files[_FORMATS] = only_2
         files.update({path.replace(_SHORT, ".js"): text for path, text in short.items()})
+    files[_WORKERS] = files.pop(_OWN_WORKERS)
     without = files.pop(_NO_NOTES)
     if not notes:
         files[_NOTES] = without

@@ -15,6 +15,7 @@ _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
 _NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
 _NUMBER = re.compile(r"^const ([A-Z][A-Z0-9_]*) = (\d[0-9a-fx .*/<-]*);\n", re.MULTILINE)
+_LOCAL = re.compile(r"(?<=[ (])const (?=\w+ (?:=|of) |[\[{])")  # In functions: of others, engines know that they stay
 _LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 _OUTSIDE = re.compile(r"\b(?:uniform|in|out) [^;(){}]*;")  # Names that the page or another shader of GLSL knows
 _DECLARED = re.compile(r"\b(?:float|int|u?vec[234]|mat3|void) (\w+)|, (\w+) = ")
@@ -58,7 +59,7 @@ def join_modules(files: Mapping[str, str], entries: Mapping[str, str]) -> str:
     body = "\n".join([*parts.values(), "const entries = {", *begin, "};"])
     chosen = "entries[globalThis.document ? 'page' : globalThis.name]();"
     own = "const ownScript = () => `(${joined})()`;"
-    body = _with_numbers(body)
+    body = _LOCAL.sub("let ", _with_numbers(body))  # one word for both, for gzip
     return shorten_script(f"(function joined() {{\n'use strict';\n{own}\n{body}\n{chosen}\n}})();") + "\n"
 
 
@@ -83,8 +84,6 @@ def _add(files: Mapping[str, str], path: str, parts: dict[str, str]) -> None:
                 raise ValueError(f"{path}: cannot join {found[0]!r}")
             _add(files, posixpath.normpath(posixpath.join(folder, found[2])), parts)
     text = _EXPORT.sub("", _EXPORT_FROM.sub("", _IMPORT.sub("", text)))
-    # A page from disk may start workers from a script only, and scripts have no `import.meta`.
-    text = text.replace("import.meta.url", "document.baseURI")
     if left := _LEFT.search(text):
         raise ValueError(f"{path}: cannot join {left[0]!r}")
     parts[path] = text.strip()
@@ -105,6 +104,7 @@ def shorten_shader(text: str) -> str:
     text = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
     text = _DIGITS.sub(lambda found: f"{float(found[0]):.9g}", _renamed(text))
     text = re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", text)
+    text = re.sub(r"(?<=[(){},;])\n(?!#)", "", text)
     # Two signs beside each other would become another one.
     return re.sub(r"(?<![+-]) ?([+-]=?) ?(?![+-])", r"\1", text)
 

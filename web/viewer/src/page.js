@@ -122,11 +122,12 @@ function shortcut(viewer, event) {
   // Brackets need Alt on many keyboards.
   const plain = !event.metaKey && (/^[[\]]$/.test(event.key) || !(event.ctrlKey || event.altKey));
   if (isTyping(event) || !plain) return;
+  const press = (id) => () => find(id).click();
   const acts = {
-    r: () => viewer.setPose(viewer.pose ?? 0),
-    f: fullScreen,
-    l: () => copyLink(viewer),
-    p: () => save(viewer),
+    r: press('reset'),
+    f: press('full'),
+    l: press('link'),
+    p: press('save'),
     '[': () => turnPage(viewer, -1),
     ']': () => turnPage(viewer, 1),
     '?': () => (find('panel').open = !find('panel').open),

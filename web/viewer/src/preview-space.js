@@ -1,3 +1,5 @@
+import { distanceTo } from './space.js';
+
 /** A preview beside chunks that come in any order. A row of it goes when that chunk of the first layer comes in whose box it lies. */
 export class SpacePreview {
   /**
@@ -26,9 +28,7 @@ export class SpacePreview {
   #cellAt(at) {
     let [best, least] = [null, Infinity];
     for (const cell of this.cells) {
-      const { low, high } = cell.part;
-      const away = Math.hypot(...at.map((value, axis) => Math.max(low[axis] - value, 0, value - high[axis])));
-      const cost = away || -1 / cell.volume;
+      const cost = distanceTo(cell.part, at) || -1 / cell.volume;
       if (cost < least) [best, least] = [cell, cost];
     }
     return best;

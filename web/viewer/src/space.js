@@ -153,6 +153,7 @@ function farthest({ low, high }, plane, eye) {
   return dot(plane, subtract(corner, eye));
 }
 
-function distanceTo({ low, high }, eye) {
+/** How far a place is from a box; 0 inside. */
+export function distanceTo({ low, high }, eye) {
   return Math.hypot(...eye.map((value, axis) => Math.max(low[axis] - value, 0, value - high[axis])));
 }
