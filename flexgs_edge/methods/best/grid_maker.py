@@ -29,6 +29,7 @@ from flexgs_edge.scene.source import MemorySource, Planes
 FINE = 2.0**-8
 """Steps as shares of others, where they shall round nothing: of colours before their refit; and of the multiplier that chooses
 steps, where the format alone rounds."""
+DEAR = 4.0  # A landing leaves Gaussians that cost so many times what their bits are worth
 
 
 def fits(count: int, first: float = 1.6, last: float = 0.8) -> list[float]:
@@ -304,14 +305,19 @@ class GridMaker:
         grid = lowered(grid, self.rounds.storage)
         size, limit = self.size_of(grid), target.limit_bytes
         if limit is not None and 0.0 < math.log(size / limit) <= REACH:
-            grid, size = self._landed(grid, size, limit)
+            grid, size = self._landed(grid, size, limit, multiplier)
         measurement = self.measure(self._decoded(grid))
         excess, seconds = target.excess(size, measurement), time.perf_counter() - started
         return Candidate(multiplier, grid.count, grid.sh_count, size, measurement, excess, seconds, left_out), grid
 
-    def _landed(self, grid: GridScene, size: int, limit: int) -> tuple[GridScene, int]:
-        """`land`, and then the constant colours, which had been fitted to what is gone, once more."""
-        landed, less = land(grid, self._removal_costs(grid), size, limit, self.size_of, self.rounds.storage)
+    def _landed(self, grid: GridScene, size: int, limit: int, multiplier: float) -> tuple[GridScene, int]:
+        """`land`, and then the constant colours, which had been fitted to what is gone, once more.
+
+        Where a Gaussian costs far more than its bits are worth, a coarser grid is better.
+        """
+        removal, worth = self._removal_costs(grid), DEAR * multiplier * 8 * size / grid.count
+        removal[removal > worth] = np.inf
+        landed, less = land(grid, removal, size, limit, self.size_of, self.rounds.storage)
         if landed is grid or not self.refit:
             return landed, less
         mended = self._with_constants(landed)

@@ -6,6 +6,7 @@ search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluato
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_byte
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import Candidate, Maker, Product, search
+from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, Maker, Product, joined, search
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
@@ -45,6 +46,7 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.references import Original, References
 
+PLAIN = 2  # Most candidates of a size without a descent
 See = Callable[[Sequence[int], int], bool]
 MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
@@ -221,21 +223,28 @@ def search_best(
         with References(renderer.storage.folder) as references, run.clock.stage("search"):
             between = poses_between(poses.cameras) if plan.steps else ()
             turns = poses.known.slopes([*poses.cameras, *between]) if poses.known and plan.steps else None
-            rounds = PruneRounds(
-                Original(
-                    renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns, depth
-                ),
-                source,
-                refit=options.refit,
-                unseen_share=options.unseen_share,
-                checkpoint=checkpoint,
+            original = Original(
+                renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns, depth
             )
-            found = search(
-                make(rounds, measure, see if options.makes_poses else None),
-                target,
-                best_effort=options.takes_closest,
-                on_step=lambda step: LOG.info("%s", step_words(as_step(step, source.count), target)),
-            )
+
+            def rounds_of(original: Original, checkpoint: Checkpoint | None) -> PruneRounds:
+                return PruneRounds(original, source, options.refit, options.unseen_share, checkpoint)
+
+            def tell(step: Candidate) -> None:
+                LOG.info("%s", step_words(as_step(step, source.count), target))
+
+            plain, tried = None, MOST_TRIED
+            if target.limit_bytes is not None and plan.steps:
+                # Where the size has room for about all rows, pruning for a descent loses more than the descent mends.
+                maker = make(rounds_of(replace(original, steps=0), None), measure, None)
+                plain = search(maker, target, tried=PLAIN, best_effort=True, on_step=tell)
+                tried -= len(plain.steps)
+            rounds = rounds_of(original, checkpoint)
+            takes_closest = options.takes_closest or (plain is not None and plain.reached)
+            maker = make(rounds, measure, see if options.makes_poses else None)
+            found = search(maker, target, tried=tried, best_effort=takes_closest, on_step=tell)
+            if plain is not None:
+                found = joined(plain, found, target)
     finally:
         run.budget.give(plan.held)
     if found.chosen.left_out:

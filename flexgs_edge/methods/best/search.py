@@ -133,10 +133,17 @@ class RateResult(Generic[Product]):
     steps: tuple[Candidate, ...]  # all candidates in the order of the search
 
 
+def joined(first: RateResult[Product], later: RateResult[Product], target: Target) -> RateResult[Product]:
+    """The better one of the answers of two searches, with the candidates of both."""
+    best = later if better(later.chosen, first.chosen, target) else first
+    return RateResult(best.product, best.chosen, best.reached, first.steps + later.steps)
+
+
 def search(
     maker: Maker[Product],  # makes the candidates
     target: Target,  # what must hold
     most: int = 4,  # most candidates, if one of them holds
+    tried: int = MOST_TRIED,  # most candidates of a size or while none holds, and of all with those that lost Gaussians
     best_effort: bool = False,  # answer with the closest candidate if none holds
     on_step: Callable[[Candidate], None] | None = None,  # called with each candidate
 ) -> RateResult[Product]:
@@ -167,14 +174,14 @@ def search(
                 maker.discard(product)
             # A size is close enough within .3 %.
             close = best[0].holds and best[0].excess > -(0.003 if by_size else maker.close)
-            if close or len(steps) >= (most if best[0].holds and not by_size else MOST_TRIED):
+            if close or len(steps) >= (most if best[0].holds and not by_size else tried):
                 break
             lost = [] if best[0].holds else lost_views(target, step.measurement)
             seen = bool(lost) and maker.see(lost)
             # The same multiplier has other costs now, so that nothing but a miss of it is known.
             place = place if seen else next_place(steps, target)
         if best is not None and best[0].holds and not by_size:
-            best = maker.trim(*best, target, tell, MOST_TRIED - len(steps))
+            best = maker.trim(*best, target, tell, tried - len(steps))
     except KeyboardInterrupt:
         if best is None:
             raise
@@ -191,10 +198,10 @@ def search(
 
 
 def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
-    """Log of the multiplier whose candidate we expect just below the target, found by at most four probes."""
+    """Log of the multiplier whose candidate we expect just below the target, found by at most 4 probes, 12 of a size."""
     seen: list[tuple[float, float]] = []
-    slope = SLOPE if target.limit_bytes is None else SIZE_SLOPE
-    for _ in range(4):
+    slope, most = (SLOPE, 4) if target.limit_bytes is None else (SIZE_SLOPE, 12)
+    for _ in range(most):
         excess = maker.probe(math.exp(place), target)
         if excess is None or abs(excess - AIM) < -AIM:
             break

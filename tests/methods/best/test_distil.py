@@ -12,6 +12,8 @@ import pytest
 
 from fits import use_fit
 from flexgs_edge.cameras.camera import Camera
+from flexgs_edge.cameras.candidates import look
+from flexgs_edge.cameras.directions import fibonacci
 from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.v2.encode import encode_grid
 from flexgs_edge.commands.compress import compress
@@ -19,6 +21,7 @@ from flexgs_edge.errors import BudgetError, InputError
 from flexgs_edge.grid.grid_scene import from_grid
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.io.ply import write_ply
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.methods.best.refit.colour import refit_colours
@@ -35,11 +38,12 @@ from flexgs_edge.methods.best.refit.finetune import (
 from flexgs_edge.quality.similarity import ssims
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.options import CompressOptions
+from flexgs_edge.run.view_set import GivenViews
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.views.references import Original, References
 from kernel_fixtures import large_budget, open_form, same_bits
-from synthetic import look_from, make_camera, random_scene
+from synthetic import look_from, make_camera, make_splats, random_scene
 from tiny_project import make_project
 
 Planes = dict[str, np.ndarray]
@@ -270,6 +274,22 @@ def test_distilled_files_lose_less_in_the_same_bytes(sample_dir: Path, tmp_path:
     assert found.quality.fidelity > plain.quality.fidelity + 2.0
     assert again.quality == found.quality
     assert (tmp_path / "a.fgs").read_bytes() == (tmp_path / "b.fgs").read_bytes()
+
+
+def test_a_size_that_has_room_for_all_is_not_pruned_for_a_descent(tmp_path: Path) -> None:
+    """A surface without a Gaussian to spare: each that goes leaves a hole."""
+    points = np.array(fibonacci(400))
+    write_ply(tmp_path / "lone.ply", make_splats(points, np.full((400, 3), 0.06), colours=abs(points)))
+    cameras = [
+        look(str(k), -4 * line, line, np.array([0.1, 1, 0.2]), 80, 80, 120.0) for k, line in enumerate(fibonacci(24))
+    ]
+    words: dict[str, Any] = {"effort": "fast", "max_size": 5000, "dry_run": True}
+    plain, found = (
+        compress(tmp_path / "lone.ply", None, given=GivenViews(cameras), distil=n, **words) for n in (0, 40)
+    )
+    assert plain.quality is not None and found.quality is not None and found.search is not None
+    assert (found.quality.fidelity or 0.0) > (plain.quality.fidelity or 0.0) - 0.2
+    assert found.size <= 5000 and len(found.search.steps) <= 6
 
 
 @pytest.mark.parametrize(

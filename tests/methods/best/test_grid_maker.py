@@ -57,6 +57,18 @@ def test_a_size_is_met(limit: int) -> None:
     assert found.reached and 0.95 * limit < found.chosen.size <= limit
 
 
+def test_no_dear_gaussian_goes_for_a_few_bytes() -> None:
+    made = Mended(FakeRounds(), refit=False)
+    multiplier = made.start(MaxSize(3000, "drop"))
+    grid = made.make(multiplier, MaxSize(3000, "drop"))[1]
+    size, dearest = made.size_of(grid), float(made._removal_costs(grid)[-1])
+    bits = 8 * size / grid.count
+    landed, less = made._landed(grid, size, size - 20, dearest / bits)
+    assert landed.count < grid.count and less <= size - 20
+    # The two cheapest rows cost nothing, and one more would be needed.
+    assert made._landed(grid, size, size - 25, 1e-9 / bits) == (grid, size)
+
+
 def test_the_same_search_every_time() -> None:
     one, two = (search(Mended(FakeRounds(), refit=False), MaxDrop(1.0)) for _ in range(2))
     assert [replace(s, seconds=0.0) for s in one.steps] == [replace(s, seconds=0.0) for s in two.steps]
