@@ -76,6 +76,7 @@ class CompressWords(TypedDict, total=False):
     force_lossy: bool
     layers: int | None
     preview: int | None
+    levels: bool
     scratch: str | None
     resume: bool
     report: str | None

@@ -92,6 +92,7 @@ def write_grid(
     encoded: Encoded | None = None,  # the result of `encode_grid(grid, chunk_rows)`, if the caller has it already
     storage: Storage = IN_MEMORY,  # holds the symbols until they are written
     preview: bytes = b"",
+    boxes: bool = True,  # tell where chunks lie, if there are many
 ) -> int:
     """Encode a grid scene into a file, which gets its name only when it is complete.
 
@@ -101,7 +102,8 @@ def write_grid(
     """
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
     model = encoded.model.to_bytes()
-    header = _header(grid, encoded, len(model), settings, chunk_rows, len(preview))
+    told = with_boxes(settings, grid, encoded.chunks) if boxes else settings
+    header = _header(grid, encoded, len(model), told, chunk_rows, len(preview))
     with atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
@@ -125,7 +127,8 @@ def coded_size(
 ) -> int:
     """Exact bytes of the file that `write_grid` makes of these arguments; as slow as writing it."""
     encoded = encoded or encode_grid(grid, chunk_rows, device, storage)
-    header = _header(grid, encoded, len(encoded.model.to_bytes()), settings, chunk_rows, len(preview))
+    told = with_boxes(settings, grid, encoded.chunks)
+    header = _header(grid, encoded, len(encoded.model.to_bytes()), told, chunk_rows, len(preview))
     return header.chunks_offset + sum(map(len, encoded.streams())) + header.table_bytes
 
 
@@ -134,7 +137,7 @@ def trim_container(
 ) -> int:
     """Copy as many whole layers as fit into `max_size` bytes, with the preview; return the bytes of the new file.
 
-    If not even the first layer fits, the new file is the preview.
+    If not even the first layer fits, the new file is the preview, or the preview's preview.
 
     Raises `TargetError` if nothing fits.
     """
@@ -152,10 +155,12 @@ def trim_container(
         if size <= max_size:
             break
     else:
-        if not 0 < container.header.preview.length <= max_size:
-            raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
-        with atomic_write(path, force) as file:
-            return file.write(Preview(container).data)
+        while container.header.preview.length:
+            container = Preview(container)
+            if container.size <= max_size:
+                with atomic_write(path, force) as file:
+                    return file.write(container.data)
+        raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
     with container.open() as old, atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
@@ -176,9 +181,16 @@ def _header(
 ) -> GridHeader:
     low = encoded.low.tolist()
     channels = Channels.of(_by_alphabet(encoded.model, encoded.bits), [band.shape[1] for band in grid.sh])
-    told = with_boxes(settings, grid, encoded.chunks)
     return GridHeader.of_grid(
-        grid, encoded.layers, low, encoded.model.depth, chunk_rows, model_bytes, told, channels, preview_bytes or None
+        grid,
+        encoded.layers,
+        low,
+        encoded.model.depth,
+        chunk_rows,
+        model_bytes,
+        settings,
+        channels,
+        preview_bytes or None,
     )
 
 
@@ -292,7 +304,7 @@ class GridContainer(SectionFile):
 
 
 class Preview(GridContainer):
-    """The preview of a file, which is held in memory: a file of its own.
+    """The preview of a file, which is held in memory: a file of its own, perhaps with a preview.
 
     `whole`: the file. Raises `FormatError` if anything differs from the format. Bytes count from where the preview
     begins.
@@ -301,8 +313,8 @@ class Preview(GridContainer):
     def __init__(self, whole: GridContainer) -> None:
         self.data = whole.read_preview()
         super().__init__(f"{whole.path} (preview)")
-        if self.header.preview_bytes is not None:
-            raise self._error(PREAMBLE_BYTES, "header: preview_bytes: wanted none in a preview")
+        if isinstance(whole, Preview) and self.header.preview_bytes is not None:
+            raise self._error(PREAMBLE_BYTES, "header: preview_bytes: wanted none here")
         own, others = self.header, whole.header
         if own.origin != others.origin:
             raise self._error(PREAMBLE_BYTES, f"header: origin: wanted {others.origin}, got {own.origin}")
@@ -319,6 +331,8 @@ class Preview(GridContainer):
     def verify(self) -> None:
         """Check every byte; raises `FormatError`."""
         self.read_model()
+        if self.header.preview.length:
+            Preview(self).verify()
         for entry in self.read_table():
             self.check_chunk(entry)
 

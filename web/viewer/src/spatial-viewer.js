@@ -17,16 +17,27 @@ export class SpatialViewer extends PreviewViewer {
   }
 
   /** Most splats to hold: as the page's address says, or as many as there is graphics memory for. */
-  #budget(degree) {
-    const { count, shRows } = this.renderer.most(degree);
-    return Math.min(this.roomFor({ count: 1, shRows: 1, shDegree: degree }), count, degree ? shRows : Infinity);
+  budgetOf({ shDegree }) {
+    const { count, shRows } = this.renderer.most(shDegree);
+    return Math.min(this.roomFor({ count: 1, shRows: 1, shDegree }), count, shDegree ? shRows : Infinity);
+  }
+
+  /** What is shown where chunks are missing. */
+  beside({ preview }) {
+    return new SpacePreview(this, this.space, preview);
+  }
+
+  /** What to ask the worker for next. */
+  nextPart() {
+    const part = this.space.next();
+    return part && { get: part.index, ...part.place };
   }
 
   roomOf(header) {
     this.asking = 0;
     this.rested = false;
     this.spacePreview = null;
-    this.space = Space.tells(header) ? new Space(header, this.#budget(header.shDegree)) : null;
+    this.space = Space.tells(header) ? new Space(header, this.budgetOf(header)) : null;
     if (!this.space) {
       this.loader.postMessage({ all: true });
       return super.roomOf(header);
@@ -34,7 +45,7 @@ export class SpatialViewer extends PreviewViewer {
     const { room, share } = this.space;
     this.share = share;
     if (!header.preview) return room;
-    this.spacePreview = new SpacePreview(this, this.space, header.preview);
+    this.spacePreview = this.beside(header);
     this.loader.postMessage({ preview: true, start: room.count, shStart: room.shRows });
     return this.spacePreview.room;
   }
@@ -72,10 +83,10 @@ export class SpatialViewer extends PreviewViewer {
     if (!this.space || !this.header) return;
     this.space.look(this.view);
     while (this.asking < AT_ONCE) {
-      const part = this.space.next();
+      const part = this.nextPart();
       if (!part) break;
       this.asking++;
-      this.loader.postMessage({ get: part.index, ...part.place });
+      this.loader.postMessage(part);
     }
     if (this.asking || this.rested) return;
     this.rested = true;

@@ -1,0 +1,3 @@
+import { LevelViewer } from './level-viewer.js';
+
+export const SceneViewer = LevelViewer;
