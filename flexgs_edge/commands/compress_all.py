@@ -30,8 +30,6 @@ OF_ONE_SCENE: dict[str, tuple[object, ...]] = {
     "resume": (False,),
 }  # Options that belong to one scene, and their values that suit any scene
 StrPath = str | os.PathLike[str]
-
-
 FGS = ".fgs"
 COMPANIONS = (
     "cameras.json", "transforms.json", "cfg_args", "images", "sparse",

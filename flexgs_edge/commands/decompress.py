@@ -15,17 +15,8 @@ from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import BudgetError, DeviceError, InputError
 from flexgs_edge.files import check_folder, check_writable
+from flexgs_edge.io import exchange
 from flexgs_edge.io.codes import opacities
-from flexgs_edge.io.exchange import (
-    MovedSource,
-    check_positions,
-    near_order,
-    offset_place,
-    wants_double,
-    write_foreign,
-    write_offset,
-    write_streamed,
-)
 from flexgs_edge.io.formats import FORMATS, WRITTEN, Format, written_format
 from flexgs_edge.io.ply import inria_dtype, write_ply
 from flexgs_edge.io.reading import AS_WRITTEN, PLAIN, Reading, Writing
@@ -101,7 +92,7 @@ def decompress(
         budget.take("reading the scene", scene.held_bytes)
         recenter = recenter and bool(np.any(scene.source.origin))
         if recenter:
-            check_writable(offset_place(output), force)
+            check_writable(exchange.offset_place(output), force)
     antialiased = scene.settings.get("antialiased") is True
     backend = decoder(device, scene.source, budget, clock)
     warnings: tuple[str, ...] = ()
@@ -111,27 +102,27 @@ def decompress(
             budget.require(f"writing a {format.suffix}", needed)
             source = decoded_once(scene.source, budget, needed, backend)
             scene = replace(scene, source=source)
-            source = MovedSource(source, np.zeros(3)) if recenter else source
-            warnings = check_positions(source, format, writing.force_lossy)
+            source = exchange.MovedSource(source, np.zeros(3)) if recenter else source
+            warnings = exchange.check_positions(source, format, writing.force_lossy)
             writing = replace(writing, antialiased=antialiased, force_lossy=True)  # positions are checked
             if streamed:
                 layers, preview = _layers(input, source.count, reading)
-                notes = write_streamed(
+                notes = exchange.write_streamed(
                     Path(output).parent, source, layers, preview=preview, force=force, writing=writing
                 )
             else:
-                notes = write_foreign(output, source, force=force, writing=writing)
+                notes = exchange.write_foreign(output, source, force=force, writing=writing)
         else:
             row = WRITE_COPIES * inria_dtype(scene.source.sh_degree).itemsize
             least, decoding = min(scene.source.count, LEAST_ROWS), decode_bytes(scene.source, backend)
             rows = budget.rows("decoding", row, fixed=decoding + decoding // SPARE_SHARE, minimum=least, most=65536)
             budget.take("writing rows", row * rows)  # what is left decodes further chunks ahead
             with ahead(scene.source, budget, backend):
-                double, warnings = (True, ()) if writing.double else wants_double(scene.source, rows)
+                double, warnings = (True, ()) if writing.double else exchange.wants_double(scene.source, rows)
                 notes = write_ply(output, scene.source, force=force, chunk_rows=rows, double=double)
         if recenter:
             assert format is not None
-            notes = (*notes, write_offset(output, scene.source.origin, format, force))
+            notes = (*notes, exchange.write_offset(output, scene.source.origin, format, force))
         if antialiased and not (format is not None and format.marks_antialiased):
             notes = (*notes, ANTIALIASED_NOTE)
     size = _written_bytes(Path(output)) if streamed else os.stat(output).st_size
@@ -198,7 +189,7 @@ def conversion_loss(
     """
     written = load_scene(output)
     if recentred:
-        written = replace(written, source=MovedSource(written.source, scene.source.origin))
+        written = replace(written, source=exchange.MovedSource(written.source, scene.source.origin))
     values = {} if format is None else _value_errors(scene.source, written.source, format.chunked)
     if options.cameras == NO_CAMERAS:
         return ConversionLoss(values, why=f"--cameras {NO_CAMERAS}")
@@ -233,7 +224,7 @@ def conversion_loss(
 
 def _value_errors(source: SceneSource, written: SceneSource, chunked: bool) -> dict[str, tuple[float, float]]:
     """Median and largest errors of some rows by value; the size of a splat is its largest deviation."""
-    order = near_order(source, chunked)
+    order = exchange.near_order(source, chunked)
     rows = np.arange(0, source.count, -(-source.count // _ROWS))
     fields = ["means", "log_scales", "opacity_logits", "sh_dc"]
     before, after = source.select(order[rows]).read(slice(0, rows.size), fields), written.read(rows, fields)

@@ -11,8 +11,6 @@ from flexgs_edge.errors import FormatError, InputError
 
 _ITERATION = re.compile(r"iteration_([0-9]{1,18})")
 _CFG_LIMIT = 1 << 16  # Most bytes of cfg_args, which normally has a few hundred
-
-
 POINT_CLOUD = "point_cloud.ply"  # What INRIA's program calls the scene of an iteration
 
 

@@ -15,15 +15,7 @@ import numpy as np
 from flexgs_edge.constants import SH_C0
 from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.files import atomic_write, check_readable
-from flexgs_edge.io.ply_layout import (
-    RGB,
-    SMOOTHING,
-    PlyHeader,
-    colour_names,
-    gaussian_layout,
-    read_header,
-    smoothing_of,
-)
+from flexgs_edge.io import ply_layout
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
@@ -66,11 +58,11 @@ class PlySource(SceneSource):
         check_readable(self.path, self.name)
         try:
             with open(self.path, "rb") as file:
-                header = read_header(self.name, file)
+                header = ply_layout.read_header(self.name, file)
                 stamp = _stamp(file)
-            self.sh_degree, self.notes = gaussian_layout(header)
+            self.sh_degree, self.notes = ply_layout.gaussian_layout(header)
             self.comments = header.comments
-            self._smoothed, self._colours = smoothing_of(header), colour_names(header)
+            self._smoothed, self._colours = ply_layout.smoothing_of(header), ply_layout.colour_names(header)
             self.doubles = any(p.type == "f8" for p in header.vertex.properties if p.name in FIELD["means"].ply)
             antialiased = self._smoothed or header.antialiased
             self.settings: dict[str, Any] = {} if antialiased is None else {"antialiased": antialiased}
@@ -114,7 +106,7 @@ class PlySource(SceneSource):
                     names = self._colours if field == "sh_dc" else FIELD[field].ply_names(self.sh_degree)
                     for channel, name in enumerate(names):
                         values = block[name]
-                        if name in RGB:
+                        if name in ply_layout.RGB:
                             values = (values / 255.0 - 0.5) / SH_C0
                         if field == "means":
                             values = values.astype(np.float64) - self.origin[channel]
@@ -126,7 +118,7 @@ def _smooth(block: np.ndarray) -> dict[str, np.ndarray]:
     """Log-scales and logits with the 3D filter applied: variances add, and opacity falls so that the Gaussian's sum stays."""
     scales = np.stack([block[name] for name in FIELD["log_scales"].ply]).astype(np.float64)
     with np.errstate(all="ignore"):  # a filter of 0 gives -inf; check_scene reports what is not finite
-        wide = np.logaddexp(2 * scales, 2 * np.log(block[SMOOTHING].astype(np.float64))) / 2
+        wide = np.logaddexp(2 * scales, 2 * np.log(block[ply_layout.SMOOTHING].astype(np.float64))) / 2
         log_opacity = -np.logaddexp(0, -block["opacity"].astype(np.float64)) + (scales - wide).sum(axis=0)
         logits = log_opacity - np.log(-np.expm1(log_opacity))
     return {"log_scales": wide, "opacity_logits": logits[None]}
@@ -191,7 +183,7 @@ class _ArrayRows:
 class _FileRows:
     """Rows of a file, read block by block."""
 
-    def __init__(self, path: Path, header: PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
+    def __init__(self, path: Path, header: ply_layout.PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
         self.path, self.name, self.stamp = path, header.name, stamp
         self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
         self.block_rows = max(1, min(block_rows, _BLOCK_BYTES // self.dtype.itemsize))
@@ -267,7 +259,7 @@ class _HeaderThenData:
     A plain byte stream would not do for ascii: plyfile wraps it and reads ahead, so that the bytes left could not be checked.
     """
 
-    def __init__(self, header: PlyHeader, file: BinaryIO) -> None:
+    def __init__(self, header: ply_layout.PlyHeader, file: BinaryIO) -> None:
         self.text, self.file = not header.order, file
         self.head = io.BytesIO(header.text.encode("ascii"))
         self.left = os.fstat(file.fileno()).st_size - header.data_offset
@@ -283,7 +275,7 @@ class _HeaderThenData:
         return self.file.readline().decode("ascii", "replace")
 
 
-def _load_whole(path: Path, header: PlyHeader) -> tuple[np.ndarray, int]:
+def _load_whole(path: Path, header: ply_layout.PlyHeader) -> tuple[np.ndarray, int]:
     """Load the rows of `vertex` by plyfile, for files that need it; they stay in memory as long as the source.
 
     Also returns the number of bytes behind the last element.

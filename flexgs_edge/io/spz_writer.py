@@ -9,22 +9,9 @@ import numpy as np
 import zstandard
 from deflate import gzip_compress
 
+from flexgs_edge.io import spz
 from flexgs_edge.io.codes import nearest, opacities, without_largest
 from flexgs_edge.io.reading import Writing
-from flexgs_edge.io.spz import (
-    ANTIALIASED,
-    COLOUR_SCALE,
-    FIRST_PLAIN,
-    MAGIC,
-    MAX_FRACTION_BITS,
-    PLAIN_HEADER,
-    POSITION_LIMIT,
-    ROTATION_MASK,
-    SCALE_OFFSET,
-    SCALE_STEPS,
-    SIZES,
-    SpzHeader,
-)
 from flexgs_edge.scene.source import SceneSource
 
 SH_STEP, FINE_SH_STEP = 8, 2
@@ -41,16 +28,16 @@ _ZSTD_LEVEL = 19  # 7 % smaller than the reference program's 12
 
 def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
     """Write a scene in RUB as a `.spz`; see `Format.writer`."""
-    flags = ANTIALIASED if writing.antialiased else 0
-    header = SpzHeader(writing.spz_version, source.count, source.sh_degree, fraction_bits(source), flags)
-    if header.version < FIRST_PLAIN:
+    flags = spz.ANTIALIASED if writing.antialiased else 0
+    header = spz.SpzHeader(writing.spz_version, source.count, source.sh_degree, fraction_bits(source), flags)
+    if header.version < spz.FIRST_PLAIN:
         arrays = (codes for field in header.widths for codes in _array(source, header, field))
         file.write(gzip_compress(b"".join((header.packed, *arrays)), _GZIP_LEVEL))
         return
     widths = header.widths
-    place = PLAIN_HEADER.size
-    head = (MAGIC, header.version, header.count, header.sh_degree, header.fraction_bits, flags, len(widths), place)
-    file.write(PLAIN_HEADER.pack(*head) + bytes(SIZES.size * len(widths)))
+    place = spz.PLAIN_HEADER.size
+    head = (spz.MAGIC, header.version, header.count, header.sh_degree, header.fraction_bits, flags, len(widths), place)
+    file.write(spz.PLAIN_HEADER.pack(*head) + bytes(spz.SIZES.size * len(widths)))
     table = b""
     for field, width in widths.items():
         start, size = file.tell(), width * source.count
@@ -58,7 +45,7 @@ def write_spz(file: BinaryIO, source: SceneSource, writing: Writing) -> None:
         for codes in _array(source, header, field):
             file.write(packer.compress(codes))
         file.write(packer.flush())
-        table += SIZES.pack(file.tell() - start, size)
+        table += spz.SIZES.pack(file.tell() - start, size)
     file.seek(place)
     file.write(table)
 
@@ -75,15 +62,15 @@ def fraction_bits(source: SceneSource) -> int:
         largest = max(largest, float(np.abs(planes["means"]).max(initial=0)))
         middle = np.median(planes["log_scales"], axis=0, keepdims=True)
         sizes += np.bincount(_scale_codes(middle)[:, 0], minlength=256)
-    median = int(np.searchsorted(np.cumsum(sizes), (source.count + 1) // 2)) / SCALE_STEPS - SCALE_OFFSET
+    median = int(np.searchsorted(np.cumsum(sizes), (source.count + 1) // 2)) / spz.SCALE_STEPS - spz.SCALE_OFFSET
     wanted = max(_LEAST_BITS, math.ceil(_BITS_BELOW_SIZE - median / math.log(2)))
     room = 23 - math.frexp(largest)[1]
-    if round(math.ldexp(largest, room)) > POSITION_LIMIT:
+    if round(math.ldexp(largest, room)) > spz.POSITION_LIMIT:
         room -= 1
-    return max(0, min(wanted, room, MAX_FRACTION_BITS))
+    return max(0, min(wanted, room, spz.MAX_FRACTION_BITS))
 
 
-def _array(source: SceneSource, header: SpzHeader, field: str) -> Iterator[bytes]:
+def _array(source: SceneSource, header: spz.SpzHeader, field: str) -> Iterator[bytes]:
     """The codes of one field, chunk by chunk."""
     step = _sh_step(source) if field == "sh_rest" else 0
     for rows in source.chunks(_CHUNK_ROWS):
@@ -98,7 +85,7 @@ def _array(source: SceneSource, header: SpzHeader, field: str) -> Iterator[bytes
 def position_codes(means: np.ndarray, bits: int) -> np.ndarray:
     """[n, 9] u8: coordinates [3, n] as integers of 24 bits."""
     fixed = np.rint(np.ldexp(means.T.astype(np.float64), bits))
-    words = np.clip(fixed, -POSITION_LIMIT, POSITION_LIMIT).astype("<i4", order="C")
+    words = np.clip(fixed, -spz.POSITION_LIMIT, spz.POSITION_LIMIT).astype("<i4", order="C")
     return words.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].reshape(-1, 9)
 
 
@@ -127,20 +114,20 @@ def _sh_step(source: SceneSource) -> int:
 
 
 def _scale_codes(log_scales: np.ndarray) -> np.ndarray:
-    return nearest((log_scales.T.astype(np.float64) + SCALE_OFFSET) * SCALE_STEPS)
+    return nearest((log_scales.T.astype(np.float64) + spz.SCALE_OFFSET) * spz.SCALE_STEPS)
 
 
 def smallest_three(quats: np.ndarray) -> np.ndarray:
     """[n] u32: unit quaternions [4, n] w x y z without their largest component, 10 bits for each of the others."""
     largest, others = without_largest(quats[[1, 2, 3, 0]])
-    sizes = nearest(np.abs(others) * (ROTATION_MASK / math.sqrt(0.5)), ROTATION_MASK)
-    parts = sizes | np.where(others < 0, np.uint32(ROTATION_MASK + 1), np.uint32(0))
+    sizes = nearest(np.abs(others) * (spz.ROTATION_MASK / math.sqrt(0.5)), spz.ROTATION_MASK)
+    parts = sizes | np.where(others < 0, np.uint32(spz.ROTATION_MASK + 1), np.uint32(0))
     return largest.astype(np.uint32) << 30 | parts[0] << 20 | parts[1] << 10 | parts[2]
 
 
 _CODES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "opacity_logits": lambda planes: nearest(255 * opacities(planes.T)),
-    "sh_dc": lambda planes: nearest((planes.T.astype(np.float64) * COLOUR_SCALE + 0.5) * 255),
+    "sh_dc": lambda planes: nearest((planes.T.astype(np.float64) * spz.COLOUR_SCALE + 0.5) * 255),
     "log_scales": _scale_codes,
     "quats": lambda planes: smallest_three(planes).astype("<u4"),
 }  # Codes of planes, row by row, for all fields but positions and SH

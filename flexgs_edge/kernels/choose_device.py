@@ -56,8 +56,6 @@ PROBED_STEPS = 1 << 20
 """Steps of the loop that looks for a limit. A limit beyond it would not be noticed; none is known."""
 LEAST_STEPS = 65535
 """With fewer steps of all loops together, no work-item of ours could do its part: such devices are refused."""
-
-
 _loaded_by: int | None = None  # the process that has loaded OpenCL runtimes
 WIDTHS = (16, 8, 4, 1)  # Lanes that a vector may have
 GPU_WIDTHS = (1, 4)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 FINER = 128  # Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide
 SMALLEST_STEP = 2.0**-126
 """Smallest normal float32. A range with a finer step counts as constant, since devices may flush the step to zero."""
-
-
 _Read = Callable[[slice, Sequence[str]], dict[str, np.ndarray]]
 """Reads {field: [c, n] f32} for a range of rows and some fields."""
 

@@ -8,29 +8,17 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.budget import MemoryBudget
+from flexgs_edge.render import fit
 from flexgs_edge.render.device_scene import DeviceScene
-from flexgs_edge.render.fit import (
-    COMPACT_PAIR_SHARE,
-    PAIR_BYTES,
-    PAIR_SHARE,
-    SORT_DIGIT_BITS,
-    SORT_DIGITS,
-    ViewSize,
-    chunk_shapes,
-    shapes_bytes,
-    structure_shapes,
-    target_bytes,
-    view_shapes,
-)
 
 TILES_AT_ONCE = 1024  # Tiles whose state is copied to the host at a time
 PIECES = 8  # A batch has at least so many pieces, so that at most one part in so many of its room stays empty
 MOST_COUNTED = 2**32 - 1  # Most pairs that the device counts in one block
 
 
-def view_size(backend: Backend, camera: Camera) -> ViewSize:
+def view_size(backend: Backend, camera: Camera) -> fit.ViewSize:
     """The size of a view's buffers, apart from their rows."""
-    return ViewSize(camera.width, camera.height, backend.sort_blocks, backend.tile_blocks)
+    return fit.ViewSize(camera.width, camera.height, backend.sort_blocks, backend.tile_blocks)
 
 
 def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
@@ -58,17 +46,17 @@ class ViewBuffers:
         self._references: tuple[Any, Any] | None = None
         self._structure: tuple[Any, Any] | None = None
         self._window = 0  # Side of the window that the taps and the zeros around the slopes are for; 0: none yet
-        shapes = view_shapes(self.size, count)
-        size = shapes_bytes(shapes)
+        shapes = fit.view_shapes(self.size, count)
+        size = fit.shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
         # sums need is checked here too, so that one error message names a limit that is large enough.
-        later = PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + target_bytes(scene, self.size)
+        later = fit.PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + fit.target_bytes(scene, self.size)
         what = f"a view of {count} Gaussians"
         if rows is not None:
             what = f"a view that shows {count} of {scene.count} Gaussians"
-            shapes |= chunk_shapes(scene.compact_rows)
+            shapes |= fit.chunk_shapes(scene.compact_rows)
             later += scene.shown_bytes * rows - scene.later_bytes
-            size = shapes_bytes(shapes)
+            size = fit.shapes_bytes(shapes)
         budget.require(f"{what} at {width}x{height}", size + later)
         try:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
@@ -76,14 +64,14 @@ class ViewBuffers:
                 self.reference_arrays()
             if scene.structure:
                 self.structure_room()
-            later -= target_bytes(scene, self.size)
+            later -= fit.target_bytes(scene, self.size)
             pairs = min(scene.fit.pairs, backend.most_pairs or scene.fit.pairs)
-            share, most = PAIR_SHARE, max(pairs, self.tiles)
+            share, most = fit.PAIR_SHARE, max(pairs, self.tiles)
             if rows is not None:
-                share = COMPACT_PAIR_SHARE
+                share = fit.COMPACT_PAIR_SHARE
                 # Chunks that stay use what the tile lists leave. Buffers for views that show more rows need their room.
-                scene.give_way(later + share * most * PAIR_BYTES - budget.free)
-            spare = max(budget.free - later, 0) // (share * PAIR_BYTES)
+                scene.give_way(later + share * most * fit.PAIR_BYTES - budget.free)
+            spare = max(budget.free - later, 0) // (share * fit.PAIR_BYTES)
             self.capacity = min(self.tiles + spare, most)
             self.pairs = self._array((self.capacity, 2), np.uint32)
             self.drafts = self._array((self.capacity, 3), np.uint32)
@@ -96,7 +84,7 @@ class ViewBuffers:
         self.digits, self.block_pairs = made["digits"], made["block_pairs"]
         self.pair_room, self.ends = made["pair_room"], made["ends"]
         self.state, self.image = made["state"], made["image"]
-        self.chunk = tuple(made[name] for name in chunk_shapes(0)) if rows is not None else ()
+        self.chunk = tuple(made[name] for name in fit.chunk_shapes(0)) if rows is not None else ()
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> Any:
         made = self._backend.array(shape, dtype)
@@ -145,7 +133,7 @@ class ViewBuffers:
 
     def structure_room(self) -> tuple[Any, Any]:
         """Allocate the arrays for the gradient of SSIM."""
-        taps, slopes = (self._array(shape, dtype) for shape, dtype in structure_shapes(self.size).values())
+        taps, slopes = (self._array(shape, dtype) for shape, dtype in fit.structure_shapes(self.size).values())
         self._structure = taps, slopes
         return taps, slopes
 
@@ -161,18 +149,18 @@ def sort_splats(backend: Backend, buffers: ViewBuffers, count: int) -> tuple[int
     """Sort the shown ones of `count` splats by depth into `buffers.sorted[0]`; return their number and a bound on their pairs."""
     blocks = backend.sort_blocks
     (keys_a, ids_a), (keys_b, ids_b) = buffers.sorted
-    cells = SORT_DIGITS * blocks
+    cells = fit.SORT_DIGITS * blocks
     backend.launch(
         "sort_count_first", (blocks,), count, buffers.keys, buffers.bounds, buffers.digits, buffers.block_pairs
     )
-    backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
+    backend.launch("exclusive_scan", (1,), fit.SORT_DIGITS, blocks, buffers.digits)
     backend.launch("sort_scatter_first", (blocks,), count, buffers.keys, buffers.digits, keys_a, ids_a)
     total = backend.read(buffers.digits, np.empty(1, np.uint32), cells, waits=False)
     pairs = int(backend.read(buffers.block_pairs).sum())
     shown = int(total[0])
-    for shift in (SORT_DIGIT_BITS, 2 * SORT_DIGIT_BITS):
+    for shift in (fit.SORT_DIGIT_BITS, 2 * fit.SORT_DIGIT_BITS):
         backend.launch("sort_count", (blocks,), shown, shift, keys_a, buffers.digits)
-        backend.launch("exclusive_scan", (1,), SORT_DIGITS, blocks, buffers.digits)
+        backend.launch("exclusive_scan", (1,), fit.SORT_DIGITS, blocks, buffers.digits)
         backend.launch("sort_scatter", (blocks,), shown, shift, keys_a, ids_a, buffers.digits, keys_b, ids_b)
         (keys_a, ids_a), (keys_b, ids_b) = (keys_b, ids_b), (keys_a, ids_a)
     return shown, pairs

@@ -20,18 +20,8 @@ from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import LOG, SILENT, Progress, Stopwatch
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.device_scene import DeviceScene
+from flexgs_edge.report import pages
 from flexgs_edge.report.as_json import json_text
-from flexgs_edge.report.pages import (
-    FLIP_SCALE,
-    Cleaned,
-    Live,
-    Material,
-    Shot,
-    compress_page,
-    error_map,
-    evaluate_page,
-    ramp,
-)
 from flexgs_edge.report.results import CompressResult, EvaluateResult
 from flexgs_edge.run.contents import contents
 from flexgs_edge.run.open_scene import is_fgs
@@ -75,7 +65,7 @@ def chosen_ranks(count: int) -> list[int]:
 
 def draw_shots(
     judge: QualityEvaluator, scene: DeviceScene, quality: Quality, progress: Progress = SILENT
-) -> tuple[Shot, ...]:
+) -> tuple[pages.Shot, ...]:
     """Draw and encode the pictures of some views, the worst view first."""
     order = quality.by_loss
     ranks = chosen_ranks(len(order))
@@ -85,7 +75,7 @@ def draw_shots(
         image, original, photo = judge.images(scene, view)
         width, height = shown_size(judge.cameras[view])
         shots.append(
-            Shot(
+            pages.Shot(
                 view=view,
                 camera=judge.indices[view],
                 rank=rank,
@@ -94,8 +84,8 @@ def draw_shots(
                 height=height,
                 original=encode(original, (width, height)),
                 compressed=encode(image, (width, height)),
-                error=encode_map(error_map(image, original), (width, height)),
-                flip=encode_map(np.minimum(judge.flip_map(image, original) / FLIP_SCALE, 1.0), (width, height)),
+                error=encode_map(pages.error_map(image, original), (width, height)),
+                flip=encode_map(np.minimum(judge.flip_map(image, original) / pages.FLIP_SCALE, 1.0), (width, height)),
                 photo=None if photo is None else encode(photo, (width, height)),
             )
         )
@@ -124,7 +114,7 @@ def encode_map(errors: np.ndarray, size: tuple[int, int]) -> bytes:
 
     if errors.shape != size[::-1]:
         errors = np.asarray(Image.fromarray(np.ascontiguousarray(errors)).resize(size, Image.Resampling.BOX))
-    return encode(ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
+    return encode(pages.ramp()[np.rint(errors * 255.0).astype(np.uint8)] / np.float32(255.0), size, ERROR_QUALITY)
 
 
 class Reporter:
@@ -138,10 +128,10 @@ class Reporter:
         if not os.fspath(folder):
             raise InputError("--report: expected a folder, found nothing")
         self.folder, self.force = Path(folder), force
-        self._shots: tuple[Shot, ...] = ()
+        self._shots: tuple[pages.Shot, ...] = ()
         self._contents: dict[str, Any] | None = None
-        self._live: Live | None = None
-        self._cleaned: Cleaned | None = None
+        self._live: pages.Live | None = None
+        self._cleaned: pages.Cleaned | None = None
         self._check()
 
     @classmethod
@@ -196,20 +186,22 @@ class Reporter:
     def show_cleaned(self, camera: Camera, before: np.ndarray, after: np.ndarray, removed: np.ndarray) -> None:
         """Show a view of a scene before and after a cleaning, and of what went: [H, W, 3] f32 each."""
         width, height = size = shown_size(camera)
-        self._cleaned = Cleaned(
+        self._cleaned = pages.Cleaned(
             camera.name, width, height, *(encode(image, size) for image in (before, after, removed))
         )
 
-    def show_live(self, make: Callable[[int], Live]) -> None:
+    def show_live(self, make: Callable[[int], pages.Live]) -> None:
         """Put live scenes beside the pictures; `make` gets the camera of the first picture."""
         if self._shots:
             self._live = make(self._shots[0].camera)
 
     def write(self, result: CompressResult | EvaluateResult, target: Target | None = None) -> Path:
         """Write the page and the record: both, or neither if writing fails. Returns the path of the page."""
-        material = Material(self._shots, self._contents, target, self._live, self._cleaned)
+        material = pages.Material(self._shots, self._contents, target, self._live, self._cleaned)
         words = (
-            compress_page(result, material) if isinstance(result, CompressResult) else evaluate_page(result, material)
+            pages.compress_page(result, material)
+            if isinstance(result, CompressResult)
+            else pages.evaluate_page(result, material)
         )
         made = not self.folder.exists()
         try:

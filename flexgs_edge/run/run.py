@@ -23,27 +23,10 @@ from flexgs_edge.io.reading import Reading
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import LOG, SILENT, Progress, Stopwatch
 from flexgs_edge.report.run_info import RemovedGroup
-from flexgs_edge.run.inputs import (
-    CheckedScene,
-    Options,
-    ScenePlace,
-    companions_of,
-    load_scene,
-    merge_companions,
-    resolve_drawing,
-)
+from flexgs_edge.run import inputs, view_set
 from flexgs_edge.run.open_scene import is_fgs, scene_file
 from flexgs_edge.run.options import NO_CAMERAS, NO_PHOTOS, CompressOptions
 from flexgs_edge.run.reporter import Reporter
-from flexgs_edge.run.view_set import (
-    WITHOUT_VIEWS,
-    Colour,
-    GivenViews,
-    ViewSet,
-    contrasting_background,
-    find_views,
-    near_enough,
-)
 from flexgs_edge.scene.check import without_hidden
 from flexgs_edge.scene.source import SceneSource, SelectSource, some_positions
 from flexgs_edge.small_matrices import product
@@ -82,21 +65,21 @@ class Plan:
     needs_scores: bool  # whether the method computes importance scores
 
     @classmethod
-    def make(cls, options: CompressOptions, scene: CheckedScene, views: ViewSet | None) -> Plan:
+    def make(cls, options: CompressOptions, scene: inputs.CheckedScene, views: view_set.ViewSet | None) -> Plan:
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
         if views is None:
             if options.clean is not None:
-                raise InputError(f"{WITHOUT_VIEWS}. --clean {options.clean}: views judge what goes")
+                raise InputError(f"{view_set.WITHOUT_VIEWS}. --clean {options.clean}: views judge what goes")
             if options.method != "paper":
                 raise InputError(
-                    f"{WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
+                    f"{view_set.WITHOUT_VIEWS}. Views are needed to measure what each Gaussian is worth; without them only "
                     "--method paper with both rates 0 works"
                 )
             if fixed is None or needs_scores:
                 why = "to score Gaussians and to judge the result" if fixed is None else "to score Gaussians"
                 raise InputError(
-                    f"{WITHOUT_VIEWS}. Views are needed {why}; without them only --prune-rate 0 and --sh-rate 0 work"
+                    f"{view_set.WITHOUT_VIEWS}. Views are needed {why}; without them only --prune-rate 0 and --sh-rate 0 work"
                 )
             return cls([], [], "modelled drop", None, needs_scores)
         if options.select == "test" and not views.held_out:
@@ -132,7 +115,7 @@ class Plan:
         return "size" if self.target.limit_bytes is not None else self.target.figure
 
     @staticmethod
-    def kind_of(indices: list[int], views: ViewSet | None) -> str:
+    def kind_of(indices: list[int], views: view_set.ViewSet | None) -> str:
         """Name of the kind of views at `indices`: `held-out`, `training` or `none`."""
         if not indices or views is None:
             return "none"
@@ -140,20 +123,20 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Run(Generic[Options]):
+class Run(Generic[inputs.Options]):
     """What was asked, and of what. Nothing in it changes."""
 
-    options: Options  # with near plane, background and antialiasing filled in
-    scene: CheckedScene  # checked
-    views: ViewSet | None  # `None` for `--cameras none`
+    options: inputs.Options  # with near plane, background and antialiasing filled in
+    scene: inputs.CheckedScene  # checked
+    views: view_set.ViewSet | None  # `None` for `--cameras none`
     plan: Plan | None  # what a run of `compress` needs; `None` for other commands
     budget: MemoryBudget  # one number of bytes for all of it
     clock: Stopwatch  # seconds by stage
     progress: Progress = SILENT  # bars on long work
     reporter: Reporter | None = None  # gathers the pages of `--report`
     output: Output = NO_OUTPUT  # the file that `compress` writes
-    judged: CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
-    background: Colour | None = None  # before which views are compared, if it is not that of the options
+    judged: inputs.CheckedScene | None = None  # the scene that is compared with this one (`evaluate`)
+    background: view_set.Colour | None = None  # before which views are compared, if it is not that of the options
     removed: tuple[RemovedGroup, ...] = ()  # the kinds that `--clean` found
     removed_rows: SceneSource | None = None  # the Gaussians that `--clean` removed
     warnings: tuple[str, ...] = ()  # warnings about how scene and cameras fit together; they are logged already
@@ -164,10 +147,10 @@ class Run(Generic[Options]):
         return self.scene.source
 
     @property
-    def seen(self) -> ViewSet:
+    def seen(self) -> view_set.ViewSet:
         """The views; raises `InputError` where there are none."""
         if self.views is None:
-            raise InputError(WITHOUT_VIEWS)
+            raise InputError(view_set.WITHOUT_VIEWS)
         return self.views
 
     @property
@@ -176,21 +159,21 @@ class Run(Generic[Options]):
         assert self.plan is not None and self.plan.target is not None
         return self.plan.target
 
-    def of_source(self, source: SceneSource) -> Run[Options]:
+    def of_source(self, source: SceneSource) -> Run[inputs.Options]:
         """The same run on other values."""
         return replace(self, scene=replace(self.scene, source=source))
 
 
 def open_run(
-    path: ScenePlace,  # a scene file or a model folder, or a scene that is open
-    options: Options,
+    path: inputs.ScenePlace,  # a scene file or a model folder, or a scene that is open
+    options: inputs.Options,
     progress: Progress = SILENT,
     reporter: Reporter | None = None,
     photos: bool = True,  # look for photos as well as for cameras
-    judged_path: ScenePlace | None = None,
-    given: GivenViews | None = None,  # cameras and photos from memory, instead of those that the options name
+    judged_path: inputs.ScenePlace | None = None,
+    given: view_set.GivenViews | None = None,  # cameras and photos from memory, instead of those that the options name
     decodes: bool = True,  # the command decodes a `.fgs`; `view` does not, and needs views to look through alone
-) -> Run[Options]:
+) -> Run[inputs.Options]:
     """Open a scene with its views (stage `open`).
 
     `judged_path`: a scene made from this one, which it is compared with. Both are drawn as its file says, and cameras beside it
@@ -201,20 +184,20 @@ def open_run(
     with clock.stage("open"):
         companions = _beside(path)
         if judged_path is not None:
-            companions = merge_companions(companions, _beside(judged_path))
-        scene = load_scene(path, options.drop_invalid, replace(options.reading, budget=budget))
+            companions = inputs.merge_companions(companions, _beside(judged_path))
+        scene = inputs.load_scene(path, options.drop_invalid, replace(options.reading, budget=budget))
         budget.hold(scene.held_bytes)
         if isinstance(options, CompressOptions):
             scene = replace(scene, source=without_hidden(scene.source))
         judged = None
         if judged_path is not None:
-            judged = load_scene(judged_path, options.drop_invalid, Reading(budget=budget))
+            judged = inputs.load_scene(judged_path, options.drop_invalid, Reading(budget=budget))
             budget.hold(judged.held_bytes)
             if judged.crop is not None and scene.crop is None:
                 LOG.info("the original is cropped, as %s says", judged_path)
-                scene = load_scene(scene, reading=Reading(crop=judged.crop))
+                scene = inputs.load_scene(scene, reading=Reading(crop=judged.crop))
             elif judged.crop is None and scene.crop is not None:
-                judged = load_scene(judged, reading=Reading(crop=scene.crop))
+                judged = inputs.load_scene(judged, reading=Reading(crop=scene.crop))
         if scene.crop is not None:
             if options.images not in (None, NO_PHOTOS) or (given is not None and given.images is not None):
                 raise InputError("--images: the scene is cropped, and photos show what lies beyond: leave --images out")
@@ -224,9 +207,11 @@ def open_run(
         if unread and scene.start is not None and would_place:
             options = replace(options, cameras=NO_CAMERAS)  # the file says where to start: no view has to be placed
         asked = options.near
-        options = resolve_drawing(options, judged if judged is not None and judged.settings else scene, companions)
+        options = inputs.resolve_drawing(
+            options, judged if judged is not None and judged.settings else scene, companions
+        )
         placed = scene.source if decodes else _sample(scene.source)
-        views = find_views(options, companions, placed, photos and scene.crop is None, given, budget)
+        views = view_set.find_views(options, companions, placed, photos and scene.crop is None, given, budget)
         found_beside = given is None and options.cameras is None and companions.cameras is not None
         if found_beside and views is not None and scene.start is not None and not scene.start.is_of(views.cameras):
             LOG.warning(
@@ -234,9 +219,9 @@ def open_run(
                 *(companions.cameras, scene.path),
             )
             companions = replace(companions, cameras=None, images=None)
-            views = find_views(options, companions, placed, False, None, budget)
+            views = view_set.find_views(options, companions, placed, False, None, budget)
         if asked is None and views is not None:
-            options, views = near_enough(options, views)
+            options, views = view_set.near_enough(options, views)
         found = () if views is None or unread else frame_warnings(views, scene)
         for warning in found:
             LOG.warning("warning: %s", warning)
@@ -256,11 +241,11 @@ def planned(run: Run[CompressOptions]) -> Run[CompressOptions]:
 
 
 def open_compression(
-    path: ScenePlace,
+    path: inputs.ScenePlace,
     output: str | os.PathLike[str] | None,
     options: CompressOptions,
     progress: Progress = SILENT,
-    given: GivenViews | None = None,
+    given: view_set.GivenViews | None = None,
 ) -> Run[CompressOptions]:
     """Open what `compress` needs: check its files, open the scene and its views, and plan.
 
@@ -292,10 +277,10 @@ def _affordable(run: Run[CompressOptions]) -> Run[CompressOptions]:
     return replace(run, options=replace(options, effort="fast"), warnings=(*run.warnings, note))
 
 
-def _standing_out(run: Run[CompressOptions], views: ViewSet) -> Run[CompressOptions]:
+def _standing_out(run: Run[CompressOptions], views: view_set.ViewSet) -> Run[CompressOptions]:
     """The same run before a background that the scene stands out from."""
     assert run.options.background is not None
-    background, note = contrasting_background(run.source, run.options.background)
+    background, note = view_set.contrasting_background(run.source, run.options.background)
     if note is None:
         return run
     return replace(run, background=background, views=replace(views, notes=(*views.notes, note)))
@@ -321,13 +306,13 @@ def _positioned(run: Run[CompressOptions]) -> Run[CompressOptions]:
     return replace(run, warnings=(*run.warnings, *warnings))
 
 
-def _beside(place: ScenePlace) -> Companions:
+def _beside(place: inputs.ScenePlace) -> Companions:
     """What lies beside a scene; nothing beside one from memory."""
-    path = place.path if isinstance(place, CheckedScene) else place
-    return Companions() if path is None else companions_of(path)
+    path = place.path if isinstance(place, inputs.CheckedScene) else place
+    return Companions() if path is None else inputs.companions_of(path)
 
 
-def frame_warnings(views: ViewSet, scene: CheckedScene) -> tuple[str, ...]:
+def frame_warnings(views: view_set.ViewSet, scene: inputs.CheckedScene) -> tuple[str, ...]:
     """Warn if the scene lies behind the cameras, or out of sight of most: a sample of positions and cameras tells.
 
     Files of phones often break the rule of their format. Cameras around a scene tell nothing of that, as it lies before some of

@@ -10,24 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.sections import (
-    MAX_COUNT,
-    PREAMBLE_BYTES,
-    ChunkEntry,
-    HeaderError,
-    Section,
-    SectionFile,
-    Verification,
-    canonical_json,
-    checked,
-    checked_contraction,
-    checked_integer,
-    checked_origin,
-    format_error,
-    parse_json,
-    preamble,
-    shown,
-)
+from flexgs_edge.codec import sections
 from flexgs_edge.constants import MAX_SH_DEGREE
 from flexgs_edge.errors import InputError
 from flexgs_edge.files import atomic_write
@@ -79,10 +62,10 @@ class Header:
         return FIELD[field].width(self.sh_degree)
 
     @property
-    def tables(self) -> Section:
+    def tables(self) -> sections.Section:
         """Section of the range tables, with their checksum."""
         pairs = sum(self.width(field.name) * self.groups[field.bits] for field in FIELDS)
-        return Section("ranges", PREAMBLE_BYTES + self.block, 8 * pairs + 4)
+        return sections.Section("ranges", sections.PREAMBLE_BYTES + self.block, 8 * pairs + 4)
 
     @property
     def chunk_count(self) -> int:
@@ -107,12 +90,12 @@ class Header:
             for channel in range(self.width(field.name)):
                 yield field.name, channel, length
 
-    def chunks(self) -> Iterator[Section]:
+    def chunks(self) -> Iterator[sections.Section]:
         """Yield the sections of the chunks in order."""
         offset = self.tables.offset + self.tables.length
         for chunk in range(self.chunk_count):
             length = self.chunk_bytes(chunk)
-            yield Section(f"chunk {chunk}", offset, length)
+            yield sections.Section(f"chunk {chunk}", offset, length)
             offset += length
 
     @property
@@ -121,10 +104,10 @@ class Header:
         return sum(self.width(f.name) * plane_bytes(self.rows(f.name), self.bits.of(f.name)) for f in FIELDS)
 
     @property
-    def chunk_table(self) -> Section:
+    def chunk_table(self) -> sections.Section:
         """Section of the chunk table (lengths and checksums of chunks), with its own checksum."""
         offset = self.tables.offset + self.tables.length + self.payload
-        return Section("chunk table", offset, 8 * self.chunk_count + 4)
+        return sections.Section("chunk table", offset, 8 * self.chunk_count + 4)
 
     @property
     def file_size(self) -> int:
@@ -154,7 +137,7 @@ def container_size(
 
 def header_block(settings: Mapping[str, Any]) -> int:
     """Bytes of the padded header; they depend only on the length of the settings."""
-    wanted = len(canonical_json(dict(settings))) + HEADER_OWN
+    wanted = len(sections.canonical_json(dict(settings))) + HEADER_OWN
     block = max(HEADER_MIN, -(-wanted // HEADER_STEP) * HEADER_STEP)
     if block > HEADER_MAX:
         raise InputError(f"settings: {wanted} bytes of JSON, expected at most {HEADER_MAX - HEADER_OWN}")
@@ -167,40 +150,42 @@ def encode_header(header: Header) -> bytes:
     del record["block"]  # known from the preamble
     if header.contraction is None:
         del record["contraction"]
-    return canonical_json(record).ljust(header.block)
+    return sections.canonical_json(record).ljust(header.block)
 
 
 def decode_header(block: bytes) -> Header:
     """Read and check a padded header; raises `HeaderError` for everything that `encode_header` does not write."""
-    record = parse_json(block)
+    record = sections.parse_json(block)
     if not isinstance(record, dict) or tuple(sorted(record.keys() - {"contraction"})) != _KEYS:
-        raise HeaderError(
-            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps contraction, got {shown(record)}"
+        raise sections.HeaderError(
+            f"wanted an object with the keys {', '.join(_KEYS)} and perhaps contraction, got {sections.shown(record)}"
         )
-    count = checked_integer("count", record["count"], 0, MAX_COUNT)
-    sh_count = checked_integer("sh_count", record["sh_count"], 0, count)
+    count = sections.checked_integer("count", record["count"], 0, sections.MAX_COUNT)
+    sh_count = sections.checked_integer("sh_count", record["sh_count"], 0, count)
     lowest, highest = (1, MAX_SH_DEGREE) if sh_count else (0, 0)
-    sh_degree = checked_integer("sh_degree", record["sh_degree"], lowest, highest)
+    sh_degree = sections.checked_integer("sh_degree", record["sh_degree"], lowest, highest)
     bits = BitSpec(
-        **{name: checked_integer(f"bits.{name}", v, 1, 16) for name, v in _attributes("bits", record["bits"])}
+        **{name: sections.checked_integer(f"bits.{name}", v, 1, 16) for name, v in _attributes("bits", record["bits"])}
     )
     groups = {}
     for field in FIELDS:
         rows = sh_count if field.name == "sh_rest" else count
         value = dict(_attributes("groups", record["groups"]))[field.bits]
-        groups[field.bits] = checked_integer(f"groups.{field.bits}", value, min(rows, 1), rows)
+        groups[field.bits] = sections.checked_integer(f"groups.{field.bits}", value, min(rows, 1), rows)
     settings = record["settings"]
     if not isinstance(settings, dict):
-        raise HeaderError(f"settings: wanted an object, got {shown(settings)}")
-    contraction = checked_contraction(record["contraction"]) if "contraction" in record else None
-    origin = checked_origin(record["origin"])
+        raise sections.HeaderError(f"settings: wanted an object, got {sections.shown(settings)}")
+    contraction = sections.checked_contraction(record["contraction"]) if "contraction" in record else None
+    origin = sections.checked_origin(record["origin"])
     return Header(count, sh_count, sh_degree, origin, bits, groups, settings, len(block), contraction)
 
 
 def _attributes(name: str, value: object) -> list[tuple[str, object]]:
     names = sorted(field.bits for field in FIELDS)
     if not isinstance(value, dict) or sorted(value) != names:
-        raise HeaderError(f"{name}: wanted an object with the keys {', '.join(names)}, got {shown(value)}")
+        raise sections.HeaderError(
+            f"{name}: wanted an object with the keys {', '.join(names)}, got {sections.shown(value)}"
+        )
     return list(value.items())
 
 
@@ -222,7 +207,7 @@ def write_container(
     )
     entries = []
     with atomic_write(path, force) as file:
-        for part in (preamble(VERSION, header.file_size, block), block, checked(tables)):
+        for part in (sections.preamble(VERSION, header.file_size, block), block, sections.checked(tables)):
             file.write(part)
         for chunk in range(header.chunk_count):
             checksum = 0
@@ -233,7 +218,7 @@ def write_container(
                 checksum = zlib.crc32(plane, checksum)
                 file.write(plane)
             entries.append((header.chunk_bytes(chunk), checksum))
-        file.write(checked(np.array(entries, "<u4").tobytes()))
+        file.write(sections.checked(np.array(entries, "<u4").tobytes()))
         if file.tell() != header.file_size:
             raise AssertionError(f"wrote {file.tell()} bytes, the size model says {header.file_size}")
     return header.file_size
@@ -244,7 +229,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     return Container(path).header
 
 
-class Container(SectionFile):
+class Container(sections.SectionFile):
     """A file of version 1; its header is checked against the size of the file.
 
     `path`: the file is opened for each read, and never held open. Raises `FormatError` if anything differs from the
@@ -262,7 +247,7 @@ class Container(SectionFile):
         whole = self.header.file_size
         if whole != size:
             words = f"header: its counts, bits and groups make a file of {whole} bytes, got {size}"
-            raise self._error(PREAMBLE_BYTES, words)
+            raise self._error(sections.PREAMBLE_BYTES, words)
 
     def read_ranges(self) -> Ranges:
         """Read and check the range tables of all fields."""
@@ -280,7 +265,7 @@ class Container(SectionFile):
             at += size
         return ranges
 
-    def read_chunk_table(self) -> list[ChunkEntry]:
+    def read_chunk_table(self) -> list[sections.ChunkEntry]:
         """Read and check the place and checksum of every chunk."""
         section = self.header.chunk_table
         with self.open() as file:
@@ -288,10 +273,10 @@ class Container(SectionFile):
         entries = []
         for i, (chunk, (length, checksum)) in enumerate(zip(self.header.chunks(), table.tolist(), strict=True)):
             if length != chunk.length:
-                raise format_error(
+                raise sections.format_error(
                     self.path, section.offset + 8 * i, f"{chunk.name}: length: wanted {chunk.length}, got {length}"
                 )
-            entries.append(ChunkEntry(chunk, checksum))
+            entries.append(sections.ChunkEntry(chunk, checksum))
         return entries
 
     def _check_ranges(self, field: str, low: np.ndarray, step: np.ndarray, offset: int) -> None:
@@ -301,7 +286,7 @@ class Container(SectionFile):
             good = np.isfinite(low) & np.isfinite(low + codes * step) & ((step == 0) | (step >= SMALLEST_STEP))
         if not good.all():
             channel, group = np.argwhere(~good)[0]
-            raise format_error(
+            raise sections.format_error(
                 self.path,
                 offset,
                 f"ranges of {field}, channel {channel}, group {group}: wanted finite numbers and a step of 0 or a "
@@ -309,7 +294,7 @@ class Container(SectionFile):
             )
 
 
-def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Section]:
+def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[sections.Section]:
     """Check every byte of a file, which is read in pieces.
 
     `path`: the file. `raise_errors`: if False, report damage after the header as `ok=False` instead of raising an
@@ -317,7 +302,7 @@ def verify(path: str | os.PathLike[str], raise_errors: bool = True) -> list[Sect
     """
     container = Container(path)
     header = container.header
-    found = Verification(header.block, raise_errors)
+    found = sections.Verification(header.block, raise_errors)
     found.check(header.tables, container.read_ranges)
     # Without a valid table the chunks cannot be compared with anything: they count as damaged.
     return found.check_chunks(container, header.chunk_table, container.read_chunk_table, header.chunks())

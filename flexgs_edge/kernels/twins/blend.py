@@ -75,8 +75,6 @@ PLANES = {
     4: ("weight", "red", "green", "blue", "error", "square"),
     5: ("red", "green", "blue", "slope", "x", "y", "xx", "xy", "yy"),
 }  # Planes of the fixed-point sums, for each kind of statistics
-
-
 UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][4:], FIXED_MOMENT)
 """Units of the planes whose unit is not 1 / FIXED_WEIGHT."""
 

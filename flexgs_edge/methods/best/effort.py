@@ -3,8 +3,6 @@
 Work is counted and never timed, so the same command gives the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -11,17 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.v2.device.launch import (
-    INFO,
-    PLACES,
-    PLANES,
-    RECORD,
-    Device,
-    DeviceArrays,
-    launch_coding,
-    pack_group,
-    padded,
-)
+from flexgs_edge.codec.v2.device import launch
 from flexgs_edge.codec.v2.header import check_end
 from flexgs_edge.codec.v2.ports import SHARED, Model
 from flexgs_edge.codec.v2.rans import StreamError, first_states, lane_count
@@ -31,7 +21,7 @@ from flexgs_edge.constants import RANS_PRECISION as PRECISION
 from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.scene.fields import sh_rest_count
 
-_ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT = range(len(INFO))
+_ROWS, _LANES, _WORDS, _STATUS, _FOUND, _FOUND_HIGH, _WANTED, _AT = range(len(launch.INFO))
 _NO_WORDS, _NO_CHILDREN, _NODES, _REPEATS, _CODES, _DEGREES, _LANES_END = range(1, 8)
 
 
@@ -51,7 +41,7 @@ class RowSteps:
         )
 
 
-class ChunkKernel(DeviceArrays):
+class ChunkKernel(launch.DeviceArrays):
     """Decodes several chunks of a file at once, one work-item each.
 
     `device`: a backend whose work-items run as threads of a processor. On a GPU, a chunk in one work-item would take
@@ -59,10 +49,10 @@ class ChunkKernel(DeviceArrays):
     chunk. `chunks`: number of chunks decoded at once.
     """
 
-    def __init__(self, device: Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
+    def __init__(self, device: launch.Device, model: Model, rows: int, data_bytes: int, chunks: int) -> None:
         super().__init__(device)
         self.model, self.rows, self.chunks = model, rows, chunks
-        self._stride = padded(rows)
+        self._stride = launch.padded(rows)
         self._word_stride = -(-data_bytes // 2) + RANS_LANES
         self._out_planes = _out_planes(model.sh_degree)
         self._lock = Lock()
@@ -70,10 +60,10 @@ class ChunkKernel(DeviceArrays):
             stack.callback(self.close)
             for name, values in zip(("records", "slots", "entries"), pack_model(model), strict=True):
                 device.write(self._array(name, values.shape, values.dtype), values)
-            self._array("info", (chunks, len(INFO)), np.int32)
+            self._array("info", (chunks, len(launch.INFO)), np.int32)
             self._array("states", (chunks, RANS_LANES), np.uint32)
             self._array("words", (chunks, self._word_stride), np.uint16)
-            for name, (planes, kind) in PLANES.items():
+            for name, (planes, kind) in launch.PLANES.items():
                 self._array(name, (chunks, planes, self._stride), np.dtype(kind))
             self._array("out", (chunks, self._out_planes, self._stride), np.int32)
             stack.pop_all()
@@ -81,8 +71,8 @@ class ChunkKernel(DeviceArrays):
     @staticmethod
     def bytes_of(rows: int, sh_degree: int) -> int:
         """Bytes that a chunk takes on the device, without its stream and its table of values."""
-        work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
-        return padded(rows) * (work + 4 * _out_planes(sh_degree))
+        work = sum(planes * np.dtype(kind).itemsize for planes, kind in launch.PLANES.values())
+        return launch.padded(rows) * (work + 4 * _out_planes(sh_degree))
 
     def codes(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[ChunkCodes | ValueError]:
         """Decode chunks (rows and bytes of each): the codes of each one, or the error that `decode.decode_chunk` raises."""
@@ -118,7 +108,7 @@ class ChunkKernel(DeviceArrays):
 
     def _decode(self, chunks: Sequence[tuple[int, bytes]], base_only: bool) -> list[Any]:
         """Decode chunks and leave the codes on the device; returns the error of each chunk, or None."""
-        info = np.zeros((len(chunks), len(INFO)), np.int32)
+        info = np.zeros((len(chunks), len(launch.INFO)), np.int32)
         errors: list[ValueError | None] = [None] * len(chunks)
         arrays = self._arrays
         for i, (rows, data) in enumerate(chunks):
@@ -134,11 +124,11 @@ class ChunkKernel(DeviceArrays):
             self.device.write(arrays["states"], states, i * RANS_LANES)
             self.device.write(arrays["words"], words, i * self._word_stride)
         self.device.write(arrays["info"], info)
-        launch_coding(
+        launch.launch_coding(
             self.device,
             len(chunks),
             (self._stride, self._out_planes, self.model.sh_degree),
-            [arrays[name] for name in ("info", "records", *PLANES, "out")],
+            [arrays[name] for name in ("info", "records", *launch.PLANES, "out")],
             decoding=(
                 (self._word_stride, self.model.depth, int(base_only)),
                 [arrays[name] for name in ("states", "words", "slots", "entries")],
@@ -199,16 +189,19 @@ def pack_model(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns [alphabets, 203] i32 records; [tables, 2^14] u8, the symbol of every slot; [symbols of all tables] u32
     entries.
     """
-    records = np.zeros((len(model.tables), RECORD), np.int32)
+    records = np.zeros((len(model.tables), launch.RECORD), np.int32)
     tables_before = entries_before = 0
     for i, (record, mapping, tables) in enumerate(zip(records, model.mappings, model.tables, strict=True)):
-        record[PLACES["symbols"]] = tables.size
-        record[PLACES["tables"] : PLACES["counts"]] = tables_before << PRECISION, len(tables.freqs) << PRECISION
-        slot, entry = PLACES["slots"], PLACES["entries"]
+        record[launch.PLACES["symbols"]] = tables.size
+        record[launch.PLACES["tables"] : launch.PLACES["counts"]] = (
+            tables_before << PRECISION,
+            len(tables.freqs) << PRECISION,
+        )
+        slot, entry = launch.PLACES["slots"], launch.PLACES["entries"]
         record[slot : slot + len(mapping)] = (tables_before + mapping.astype(np.int64)) << PRECISION
         record[entry : entry + len(mapping)] = entries_before + mapping.astype(np.int64) * tables.size
         if i >= SHARED:
-            pack_group(record, model.groups[i - SHARED])
+            launch.pack_group(record, model.groups[i - SHARED])
         tables_before += len(tables.freqs)
         entries_before += tables.entries.size
     slots = np.concatenate([tables.slots for tables in model.tables])

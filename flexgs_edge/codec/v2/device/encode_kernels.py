@@ -6,17 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flexgs_edge.codec.v2.device.launch import (
-    INFO,
-    PLACES,
-    PLANES,
-    RECORD,
-    Device,
-    DeviceArrays,
-    launch_coding,
-    pack_group,
-    padded,
-)
+from flexgs_edge.codec.v2.device import launch
 from flexgs_edge.codec.v2.groups import Group
 from flexgs_edge.codec.v2.ports import SHARED, CountPort, Raw
 from flexgs_edge.codec.v2.rans import Encoder
@@ -30,36 +20,36 @@ _ESCAPES = 32
 
 def device_bytes(rows: int, sh_degree: int) -> int:
     """Most bytes on a device for coding a chunk of so many rows."""
-    work = sum(planes * np.dtype(kind).itemsize for planes, kind in PLANES.values())
+    work = sum(planes * np.dtype(kind).itemsize for planes, kind in launch.PLANES.values())
     # A code, its context and symbol, three raw bytes (four for an escape, which is rare), then 6 bytes a symbol.
-    return padded(rows) * (work + 10 * (len(base_kinds()) + 3 * sh_rest_count(sh_degree))) + (1 << 22)
+    return launch.padded(rows) * (work + 10 * (len(base_kinds()) + 3 * sh_rest_count(sh_degree))) + (1 << 22)
 
 
-class CountKernel(DeviceArrays):
+class CountKernel(launch.DeviceArrays):
     """Counts the symbols of several chunks at once, one work-item each; NumPy counts those of positions.
 
     `device`: a backend whose work-items run as threads of a processor. `groups`: the groups of the model. `sh_degree`:
     SH degree of the scene. `rows`: rows of the largest chunk. `chunks`: number of chunks counted at once.
     """
 
-    def __init__(self, device: Device, groups: list[Group], sh_degree: int, rows: int, chunks: int) -> None:
+    def __init__(self, device: launch.Device, groups: list[Group], sh_degree: int, rows: int, chunks: int) -> None:
         super().__init__(device)
         self.groups, self.sh_degree = groups, sh_degree
-        self._stride = padded(rows)
+        self._stride = launch.padded(rows)
         self._planes = len(base_kinds()) + 3 * sh_rest_count(sh_degree)
         sizes = [group.contexts * group.symbols for group in groups]
         self._first = np.concatenate([[0], np.cumsum(sizes)]).tolist()
-        records = np.zeros((SHARED + len(groups), RECORD), np.int32)
+        records = np.zeros((SHARED + len(groups), launch.RECORD), np.int32)
         for record, group, first in zip(records[SHARED:], groups, self._first, strict=False):
-            record[PLACES["symbols"]], record[PLACES["counts"]] = group.symbols, first
-            pack_group(record, group)
+            record[launch.PLACES["symbols"]], record[launch.PLACES["counts"]] = group.symbols, first
+            launch.pack_group(record, group)
         self._log, self._raw = self._planes * rows, (self._planes * rows // _ESCAPES + 64) * 4
         shifts = [-(-group.shift // 8) for group in groups]
         channels = [1] * len(base_kinds()) + [2 * d + 1 for d in range(1, sh_degree + 1) for _ in range(3)]
         self._raw += rows * sum(pieces * count for pieces, count in zip(shifts, channels, strict=True))
         self._batches = self._planes * (max((rows - 1) // COARSE_ROWS, 0).bit_length() + 1)
         shapes: dict[str, tuple[tuple[int, ...], str]] = {
-            **{name: ((planes, self._stride), kind) for name, (planes, kind) in PLANES.items()},
+            **{name: ((planes, self._stride), kind) for name, (planes, kind) in launch.PLANES.items()},
             "codes": ((self._planes, self._stride), "i4"),
             "contexts": ((self._log,), "u1"),
             "symbols": ((self._log,), "u1"),
@@ -70,7 +60,7 @@ class CountKernel(DeviceArrays):
         self._sizes = {name: int(np.prod(shape)) for name, (shape, _) in shapes.items()}
         with ExitStack() as stack:
             stack.callback(self.close)
-            self._array("info", (chunks, len(INFO)), np.int32)
+            self._array("info", (chunks, len(launch.INFO)), np.int32)
             device.write(self._array("records", records.shape, np.int32), records)
             for name, (shape, kind) in shapes.items():
                 self._array(name, (chunks, *shape), np.dtype(kind))
@@ -78,10 +68,10 @@ class CountKernel(DeviceArrays):
 
     def count(self, chunks: Sequence[ChunkCodes], ports: Sequence[CountPort]) -> list[bool]:
         """Count chunks, and add each to its port; False for a chunk with too many escapes, which is not added."""
-        info = np.zeros((len(chunks), len(INFO)), np.int32)
+        info = np.zeros((len(chunks), len(launch.INFO)), np.int32)
         for i, codes in enumerate(chunks):
             rows = len(codes.cells)
-            info[i, INFO.index("rows")] = rows
+            info[i, launch.INFO.index("rows")] = rows
             planes = np.zeros((self._planes, self._stride), np.int32)
             planes[: len(codes.base), :rows] = [codes.base[kind.name] for kind in base_kinds()]
             at = len(codes.base)
@@ -92,31 +82,31 @@ class CountKernel(DeviceArrays):
             self._write("cells", i, codes.cells)
         self.device.write(self._arrays["info"], info)
         arrays = self._arrays
-        launch_coding(
+        launch.launch_coding(
             self.device,
             len(chunks),
             (self._stride, self._planes, self.sh_degree),
-            [arrays[name] for name in ("info", "records", *PLANES, "codes")],
+            [arrays[name] for name in ("info", "records", *launch.PLANES, "codes")],
             counting=(
                 (self._log, self._raw, self._first[-1], self._batches),
                 [arrays[name] for name in ("contexts", "symbols", "raw", "counts", "batches")],
             ),
         )
         self.device.read(self._arrays["info"], info)
-        counted = info[:, INFO.index("status")] == 0
+        counted = info[:, launch.INFO.index("status")] == 0
         for place in np.flatnonzero(counted).tolist():
             self._add(place, info[place].tolist(), ports[place])
         return [bool(done) for done in counted]
 
     def _add(self, place: int, info: list[int], port: CountPort) -> None:
-        batches = self._read("batches", place, (info[INFO.index("at")], 3), np.uint32).astype(np.int64)
+        batches = self._read("batches", place, (info[launch.INFO.index("at")], 3), np.uint32).astype(np.int64)
         counts = self._read("counts", place, (self._first[-1],), np.uint32).astype(np.int64)
         for i, (group, first) in enumerate(zip(self.groups, self._first, strict=False)):
             shape = port.counts[SHARED + i].shape
             port.counts[SHARED + i] += counts[first : first + group.contexts * group.symbols].reshape(shape)
         total = int(batches[:, 1].sum())
         contexts, symbols = (self._read(name, place, (total,), np.uint8) for name in ("contexts", "symbols"))
-        raw = self._read("raw", place, (info[INFO.index("words")],), np.uint8)
+        raw = self._read("raw", place, (info[launch.INFO.index("words")],), np.uint8)
         at = raw_at = 0
         for alphabet, size, escapes in batches.tolist():
             shift = self.groups[alphabet - SHARED].shift
@@ -138,7 +128,7 @@ class CountKernel(DeviceArrays):
         return self.device.read(self._arrays[name], values, place * self._sizes[name])
 
 
-def encode_streams(device: Device, encoders: Sequence[Encoder]) -> list[bytes]:
+def encode_streams(device: launch.Device, encoders: Sequence[Encoder]) -> list[bytes]:
     """Do `Encoder.finish` for several encoders at once, one work-item each."""
     sizes = [[len(batch) for batch in encoder.batches] for encoder in encoders]
     most, batch_most = max(map(sum, sizes), default=0) + 1, max(map(len, sizes), default=0) + 1

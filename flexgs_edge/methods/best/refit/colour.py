@@ -3,8 +3,6 @@
 Each round back-projects the residual images to the Gaussians' colours (SIRT). Geometry stays as it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from typing import Any

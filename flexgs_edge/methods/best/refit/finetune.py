@@ -3,8 +3,6 @@
 It needs no photos and adds no Gaussians, so the result cannot look better than the original.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -16,19 +16,7 @@ from flexgs_edge.grid.step_sizes import StepSizes
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.memory.rows import copy_rows, put_rows, read_rows
 from flexgs_edge.memory.storage import Storage
-from flexgs_edge.methods.best.refit.descent import (
-    GRID_VALUES,
-    ORDER,
-    PLANE_SETS,
-    PRICE_VALUES,
-    ChunkState,
-    Descent,
-    descent_bytes,
-    fields_of,
-    rate_record,
-    step_record,
-    widths,
-)
+from flexgs_edge.methods.best.refit import descent
 from flexgs_edge.render.chunks import ChunkArrays, ChunkBounds
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, RAW_BYTES, Fit, padded, plane_bytes, sum_bytes
@@ -66,7 +54,7 @@ class Part:
     @property
     def span(self) -> slice:
         """Elements in the files of planes."""
-        return slice(self.at, self.at + sum(widths(self.degree).values()) * self.stride)
+        return slice(self.at, self.at + sum(descent.widths(self.degree).values()) * self.stride)
 
     @property
     def powers_span(self) -> slice:
@@ -83,21 +71,21 @@ class MovingPlanes:
         self.bounds: dict[int, ChunkBounds] = {}
         self.parts: dict[int, Part] = {}
         self.values = np.zeros(0, np.float32)
-        self.steps = backend.array((GRID_VALUES,), np.float32)
+        self.steps = backend.array((descent.GRID_VALUES,), np.float32)
         self._room: Any = None
         self._drawn: Callable[[], None] = lambda: None
 
     def load(self, start: int, stop: int, planes: dict[str, Any]) -> None:
         """Put rows [start, stop) on the grid, into arrays of the backend."""
         part, stride = self.parts[start], padded(stop - start)
-        shape = (sum(widths(part.degree).values()), stride)
+        shape = (sum(descent.widths(part.degree).values()), stride)
         self._drawn()
         if self._room is None or self._room.shape != shape:
             self.close_room()
             self._room = self.backend.array(shape, np.float32)
         with self.backend.mapped(self._room) as host:
             copy_rows(self.values, part.span, host.reshape(-1))
-        stored = [planes[name] for name in ORDER]
+        stored = [planes[name] for name in descent.ORDER]
         self.backend.launch("snap", (stride,), stride, part.degree, self.steps, self._room, *stored)
         self._drawn = self.backend.mark()
         if start not in self.bounds:
@@ -137,17 +125,19 @@ def open_descent(
     origin: np.ndarray,
     camera: Camera,
     structure: float = 0.0,
-) -> Descent | StreamedDescent:
+) -> descent.Descent | StreamedDescent:
     """A descent in memory, or in scratch files if the renderer's storage has them and memory has no room.
 
     Parameters are those of `Descent`.
     """
     if renderer.storage.spills:
         source = MemorySource(planes, origin=origin)
-        with renderer.load(source, descent_bytes(source.sh_degree), references=True, structure=structure > 0) as scene:
+        with renderer.load(
+            source, descent.descent_bytes(source.sh_degree), references=True, structure=structure > 0
+        ) as scene:
             if not renderer.fits(scene, camera):
                 return StreamedDescent(renderer, planes, degrees, origin, structure)
-    return Descent(renderer, planes, degrees, origin, camera, structure)
+    return descent.Descent(renderer, planes, degrees, origin, camera, structure)
 
 
 def streamed_rows(fit: Fit, count: int) -> int:
@@ -161,8 +151,8 @@ def streamed_descent_bytes(sh_degree: int, rows: int) -> int:
     They hold the chunk's state, two copies of its planes on their way from and to the files, the values that are drawn, records
     and sums twice, and the values of a chunk that is loaded to be drawn.
     """
-    planes = 4 * sum(widths(sh_degree).values())
-    own = (PLANE_SETS + 3) * planes + plane_bytes(sh_degree) + RAW_BYTES + 4 * 4
+    planes = 4 * sum(descent.widths(sh_degree).values())
+    own = (descent.PLANE_SETS + 3) * planes + plane_bytes(sh_degree) + RAW_BYTES + 4 * 4
     return padded(rows) * (own + 2 * (4 * RECORD + sum_bytes(GRADIENT_SUMS)))
 
 
@@ -186,7 +176,7 @@ class StreamedDescent:
         self.renderer, self.backend, self.structure = renderer, renderer.backend, structure
         self.storage: Storage = renderer.storage
         source = MemorySource(planes, origin=origin, sh_count=int(np.flatnonzero(degrees).max(initial=-1)) + 1)
-        self.count, self.widths, fit = source.count, widths(source.sh_degree), renderer.fit
+        self.count, self.widths, fit = source.count, descent.widths(source.sh_degree), renderer.fit
         self._degrees, self._priced = degrees, False
         self._planes = MovingPlanes(self.backend, source)
         self._scene = DeviceScene(
@@ -200,14 +190,14 @@ class StreamedDescent:
             view_sums=GRADIENT_SUMS,
             fit=replace(fit, compact_rows=streamed_rows(fit, self.count), spare_share=1),
         )
-        self._state: ChunkState | None = None
+        self._state: descent.ChunkState | None = None
         self._chunk: ChunkArrays | None = None
         self._splats: tuple[Any, Any] | None = None
         self._arrays: list[Any] = []
         try:
             renderer.release()
             self._scene.be_compact(fit.capacity(self.count, 1 / fit.first_share))
-            self._rates, self._prices = (self._array(n) for n in (sum(self.widths.values()), PRICE_VALUES))
+            self._rates, self._prices = (self._array(n) for n in (sum(self.widths.values()), descent.PRICE_VALUES))
             self._parts = parts_of(self._scene.spans())
             self._planes.parts = {part.base: part for part in self._parts}
             size, powers = (self._parts[-1].span.stop, self._parts[-1].powers_span.stop) if self._parts else (0, 0)
@@ -225,16 +215,16 @@ class StreamedDescent:
         return self._arrays[-1]
 
     def _fill(self, part: Part, planes: dict[str, np.ndarray]) -> None:
-        own = widths(part.degree)
+        own = descent.widths(part.degree)
         values = np.zeros((sum(own.values()), part.stride), np.float32)
-        for _, rows, some in fields_of(planes, own):
+        for _, rows, some in descent.fields_of(planes, own):
             read = read_rows(some, slice(part.base, part.base + part.count))
             values[rows, : part.count] = read.reshape(-1, part.count)
         put_rows(self._planes.values, part.span, values.reshape(-1))
 
     def put_on(self, steps: StepSizes | None) -> None:
         """As `Descent.put_on`."""
-        self.backend.write(self._planes.steps, step_record(steps))
+        self.backend.write(self._planes.steps, descent.step_record(steps))
         self._planes.bounds.clear()
 
     def price(self, prices: np.ndarray) -> None:
@@ -247,7 +237,7 @@ class StreamedDescent:
         sums = self.renderer.gradient_sums(self._scene, camera, target, self.structure)
         records, shown = self.renderer.records_array, self.renderer.view_rows
         assert shown is not None
-        self.backend.write(self._rates, rate_record(rates, self.widths))
+        self.backend.write(self._rates, descent.rate_record(rates, self.widths))
         ends = np.searchsorted(shown, [part.base + part.count for part in self._parts])
         for part, first, last in zip(self._parts, [0, *ends[:-1]], ends, strict=True):
             if first == last:
@@ -286,7 +276,7 @@ class StreamedDescent:
         if part.mean == "own":
             self._save(self._mean, part.span, state.mean)
 
-    def _opened(self, part: Part) -> ChunkState:
+    def _opened(self, part: Part) -> descent.ChunkState:
         """The state of a chunk on the backend, without its mean."""
         state = self._room_for(part)
         self._load(state.values, self._planes.values, part.span)
@@ -299,7 +289,7 @@ class StreamedDescent:
         state.put_degrees(self._degrees[part.base : part.base + part.count])
         return state
 
-    def _follow_up(self, part: Part, state: ChunkState) -> None:
+    def _follow_up(self, part: Part, state: descent.ChunkState) -> None:
         """Bring the mean up to the values as they are, and make it the chunk's own, if there is one."""
         if part.mean == "own":
             self._load(state.mean, self._mean, part.span)
@@ -310,11 +300,11 @@ class StreamedDescent:
             state.follow(share)
         part.pending = []
 
-    def _room_for(self, part: Part) -> ChunkState:
+    def _room_for(self, part: Part) -> descent.ChunkState:
         if self._state is None or (self._state.chunk.degree, self._state.chunk.stride) != (part.degree, part.stride):
             self._free_room()
             self._chunk = ChunkArrays(self.backend, part.degree, part.stride)
-            self._state = ChunkState(self.backend, self._chunk.chunk(0, part.count), self.renderer.antialiased)
+            self._state = descent.ChunkState(self.backend, self._chunk.chunk(0, part.count), self.renderer.antialiased)
         self._state.chunk.count = part.count
         return self._state
 
@@ -363,8 +353,8 @@ class StreamedDescent:
         for part in self._parts:
             span = slice(part.base, part.base + part.count)
             values = read_rows(self._planes.values, part.span).reshape(-1, part.stride)[:, : part.count]
-            own = widths(part.degree)
-            for name, rows, out in fields_of(whole, own):
+            own = descent.widths(part.degree)
+            for name, rows, out in descent.fields_of(whole, own):
                 put_rows(out, span, values[rows].reshape(*out.shape[:-1], part.count))
                 if own[name] < self.widths[name]:
                     rest = whole[name].reshape(3, -1, self.count)[:, own[name] // 3 :]
