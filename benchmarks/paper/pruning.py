@@ -11,7 +11,7 @@ from benchmarks.paper.scene import Point, Setting, StudyScene, beside
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.methods.paper.search import CANDIDATES
 from flexgs_edge.report.plots import LineChart, Series
-from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns, number
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, number
 
 DIAGONAL = tuple(range(50, 501, 50))  # Rates p = s of the ADP curve, in thousandths. Nothing was tuned for this split.
 GRID = 100  # Step of the rates in `plane`, in thousandths. The paper's candidates lie on this grid.
@@ -61,7 +61,7 @@ def splits(studied: StudyScene) -> Experiment:
         if level == method:
             equal_to = point.size
         rows.append({"level": level, "equal_to": equal_to, "method": method, **_rates(choice), **studied.cells(point)})
-    heads = columns(level="bytes as", equal_to="bytes wanted", method="method", **RATES, **FIGURES)
+    heads = dict(level="bytes as", equal_to="bytes wanted", method="method", **RATES, **FIGURES)
     table = Table(heads, tuple(rows))
     figure = studied.figure
 
@@ -142,7 +142,7 @@ def plane(studied: StudyScene) -> Experiment:
         rows.append(
             {"kind": "frontier", "step": None, "prune_rate": p, "sh_rate": s, **empty, "size": size, "ratio": ratio}
         )
-    table = Table(columns(kind="kind", step="step", **RATES, **FIGURES), tuple(rows))
+    table = Table(dict(kind="kind", step="step", **RATES, **FIGURES), tuple(rows))
     grid = [row for row in rows if row["kind"] in ("cell", "candidate")]
     chosen = studied.point(Setting(search.chosen.choice))
     answer = studied.cells(chosen)
@@ -238,7 +238,7 @@ def scores(studied: StudyScene) -> Experiment:
         {"score": point.setting.score, **_rates(point.setting.choice), **studied.cells(point)}
         for point in studied.points(wanted, "scores")
     ]
-    table = Table(columns(score="score", **RATES, **FIGURES), tuple(rows))
+    table = Table(dict(score="score", **RATES, **FIGURES), tuple(rows))
     figure = studied.figure
     gs, meson = (table.values(figure, score=score) for score in kinds)
     gaps = [b - a for a, b in zip(gs, meson)]

@@ -10,7 +10,7 @@ from flexgs_edge.packed.bitpack import PAPER, BitSpec
 from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.run.run import EVERYTHING
 from flexgs_edge.scene.fields import FIELDS
-from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table
 
 RTN_BITS = tuple(range(2, 9))
 FINE = BitSpec.rtn(16)  # Stands for unquantized values: 16 bits in sub-groups lose less than renders show
@@ -27,7 +27,7 @@ def rtn(studied: StudyScene) -> Experiment:
         {"coding": "RTN", "bits": bits, **studied.cells(point)} for bits, point in zip(RTN_BITS, plain)
     ]
     rows.append({"coding": "MPQ", "bits": None, **studied.cells(studied.point(Setting()))})
-    table = Table(columns(coding="coding", bits="bits a value", **FIGURES), tuple(rows))
+    table = Table(dict(coding="coding", bits="bits a value", **FIGURES), tuple(rows))
     figure = studied.figure
 
     def series(label: str, coding: str, notes: list[str]) -> Series:
@@ -70,7 +70,7 @@ def attributes(studied: StudyScene) -> Experiment:
         for (name, bits), point in zip(alone, found)
     ]
     rows.insert(0, {"attribute": "none", "bits": 16, **studied.cells(floor), "rise": 0.0})
-    heads = columns(attribute="attribute", bits="bits", **FIGURES, rise="rise of the squared error")
+    heads = dict(attribute="attribute", bits="bits", **FIGURES, rise="rise of the squared error")
     table = Table(heads, tuple(rows))
     figure = studied.figure
     losses = {bits: table.values(figure, bits=bits) for bits in ALONE_BITS}
@@ -116,7 +116,7 @@ def groups(studied: StudyScene) -> Experiment:
                     "error": _scientific(studied.error(point)),
                 }
             )
-    heads = columns(
+    heads = dict(
         pruned="pruned", groups="groups", extra_bytes="bytes beyond one group", **FIGURES, error="squared error"
     )
     table = Table(heads, tuple(rows))

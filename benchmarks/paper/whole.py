@@ -17,7 +17,7 @@ from flexgs_edge.report.plots import BarChart, LineChart, Series
 from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.run.run import EVERYTHING
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, SelectSource
-from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table, columns
+from flexgs_edge.studies.written import FIGURES, Cell, Experiment, Table
 
 RATIOS = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 STRONGEST = Choice(MAX_PRUNE, 1000 - MAX_PRUNE)  # The strongest compression that the search may choose
@@ -74,7 +74,7 @@ def parts(studied: StudyScene) -> Experiment:
         {"method": "MPQ only", **studied.cells(quantized)},
         {"method": "ADP and MPQ", **studied.cells(both)},
     ]
-    table = Table(columns(method="method", **FIGURES), tuple(rows))
+    table = Table(dict(method="method", **FIGURES), tuple(rows))
     figure = studied.figure
     losses = [float(row[figure] or 0.0) for row in rows]
     words = [f"{row['method']}: {row['ratio']:.1f}x, {loss:.2f} dB" for row, loss in zip(rows, losses)]
@@ -113,7 +113,7 @@ def rates(studied: StudyScene) -> Experiment:
         if found.reached:
             rows.append(_rate_row(studied, "search", ratio, found.chosen.choice))
     rows.append(_rate_row(studied, "most", None, STRONGEST))
-    heads = columns(kind="kind", wanted_ratio="ratio wanted", **RATES, **FIGURES)
+    heads = dict(kind="kind", wanted_ratio="ratio wanted", **RATES, **FIGURES)
     table = Table(heads, tuple(rows))
     figure = studied.figure
     reached = table.values("wanted_ratio", kind="search")
@@ -178,7 +178,7 @@ def times(studied: StudyScene) -> Experiment:
     rows.append(_time("step: all", step, PAPER_STEP_ALL))
     rows += [_time(f"search step {number}", taken.seconds) for number, taken in enumerate(steps, 1)]
     rows.append({"part": "peak memory", "value": memory, "unit": "bytes", "paper": None})
-    table = Table(columns(part="part", value="here", unit="unit", paper="paper, RTX 3090"), tuple(rows))
+    table = Table({"part": "part", "value": "here", "unit": "unit", "paper": "paper, RTX 3090"}, tuple(rows))
     source, views = studied.run.source, studied.views
     return Experiment(
         "times",

@@ -48,12 +48,9 @@ class LazyGroup(click.Group):
         return next(command for command in found if isinstance(command, click.Command))
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        self.format_commands(ctx, formatter)
-        click.Command.format_options(self, ctx, formatter)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(list(self.lines.items()))
+        click.Command.format_options(self, ctx, formatter)
 
 
 class SectionOption(click.Option):

@@ -103,7 +103,7 @@ def read_compressed_ply(path: Path, name: str, reading: Reading) -> CompressedPl
         for element in header.elements:
             if element.name in elements:
                 file.seek(at)
-                rows[element.name] = _rows(file, header, element)
+                rows[element.name] = np.fromfile(file, header.dtype(element), element.count)
             at += element.count * element.row_size
     ranges = {
         field: (_columns(rows["chunk"], low), _columns(rows["chunk"], high))
@@ -173,11 +173,6 @@ def _need(name: str, element: Element, names: tuple[str, ...], kind: str) -> Non
                 f"{name}: element {element.name!r}: expected property {each!r} of type {words}, found "
                 f"{found.get(each, 'none')}"
             )
-
-
-def _rows(file: BinaryIO, header: PlyHeader, element: Element) -> np.ndarray:
-    dtype = np.dtype([(p.name, header.order + p.type) for p in element.properties])
-    return np.fromfile(file, dtype, element.count)
 
 
 def _columns(rows: np.ndarray, names: tuple[str, ...]) -> np.ndarray:

@@ -185,7 +185,8 @@ class _FileRows:
 
     def __init__(self, path: Path, header: ply_layout.PlyHeader, stamp: tuple[int, int, int], block_rows: int) -> None:
         self.path, self.name, self.stamp = path, header.name, stamp
-        self.offset, self.dtype = header.vertex_offset, header.vertex_dtype
+        self.offset = header.data_offset + sum(element.count * element.row_size for element in header.before)
+        self.dtype = header.dtype(header.vertex)
         self.block_rows = max(1, min(block_rows, _BLOCK_BYTES // self.dtype.itemsize))
 
     def blocks(self, rows: Rows) -> Iterator[tuple[slice, np.ndarray]]:

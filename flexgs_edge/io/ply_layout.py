@@ -94,11 +94,6 @@ class PlyHeader:
         return bool(self.order) and all(element.scalar for element in (*self.before, self.vertex))
 
     @property
-    def vertex_offset(self) -> int:
-        """First byte of the rows of `vertex`, in plain files."""
-        return self.data_offset + sum(element.count * element.row_size for element in self.before)
-
-    @property
     def text(self) -> str:
         """The header as text, without comments."""
         names = {order: name for name, order in _FORMATS.items()}
@@ -110,10 +105,9 @@ class PlyHeader:
                 lines.append(f"property {kind} {p.name}")
         return "\n".join([*lines, "end_header", ""])
 
-    @property
-    def vertex_dtype(self) -> np.dtype:
-        """One row of `vertex` in the file, for plain files."""
-        return np.dtype([(p.name, self.order + p.type) for p in self.vertex.properties])
+    def dtype(self, element: Element) -> np.dtype:
+        """One row of an element without lists, in a binary file."""
+        return np.dtype([(p.name, self.order + p.type) for p in element.properties])
 
     def whole_bytes(self, size: int) -> int:
         """About how many bytes plyfile takes to read a file of `size` bytes as a whole."""

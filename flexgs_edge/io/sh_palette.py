@@ -8,6 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from flexgs_edge.memory.rows import blocks
+
 _BINS = 1024
 _ROUNDS = 10
 _LARGEST = 511  # Largest whole number: 45 squares of it, and any part of their sum, stay below 2^24
@@ -22,6 +24,7 @@ _SHARE = 0.15
 _SAMPLE = 4  # Vectors that clusters are merged from, for each entry of the palette
 _PASSES = 4  # Passes in which vectors choose the best entry near theirs, and entries move to the mean of their vectors
 _BLOCK = 1 << 21  # Products held at a time
+_ROWS = 65536  # Rows whose values are rounded, or added up, at a time
 
 
 def best_codebook(values: np.ndarray, weights: np.ndarray | None = None, size: int = 256) -> np.ndarray:
@@ -152,7 +155,7 @@ def sh_palette(values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """
     step = _step(values)
     whole = np.empty(values.shape, np.int16)
-    for part in _parts(len(values)):
+    for part in blocks(len(values), _ROWS):
         whole[part] = np.clip(np.rint(values[part] / step), -_LARGEST, _LARGEST)
     points, inverse, counts = np.unique(whole, axis=0, return_inverse=True, return_counts=True)
     del whole
@@ -179,8 +182,8 @@ def _by_first_use(labels: np.ndarray) -> np.ndarray:
 
 def _step(values: np.ndarray) -> np.float32:
     """The size of a whole number: a power of two, so that rounding in a sum cannot change it but for rare chance."""
-    square = sum(float(np.square(values[part], dtype=np.float64).sum()) for part in _parts(len(values)))
-    largest = max((float(np.abs(values[part]).max(initial=0)) for part in _parts(len(values))), default=0.0)
+    square = sum(float(np.square(values[part], dtype=np.float64).sum()) for part in blocks(len(values), _ROWS))
+    largest = max((float(np.abs(values[part]).max(initial=0)) for part in blocks(len(values), _ROWS)), default=0.0)
     reach = min(largest, _CLIP * float(np.sqrt(square / max(values.size, 1))))
     return np.float32(2.0 ** np.ceil(np.log2(reach / _LARGEST))) if reach > 0 else np.float32(1)
 
@@ -254,7 +257,7 @@ def _nearest_partners(
     place = np.zeros(len(entries), np.int64)
     for members, near in _neighbourhoods(homes, homes, centres):
         place[near] = np.arange(len(near))
-        for part in _parts(len(members), max(_BLOCK // len(near), 1)):
+        for part in blocks(len(members), max(_BLOCK // len(near), 1)):
             some = members[part]
             loss = (squares[some, None] + squares[near]) - 2 * (entries[some] @ entries[near].T)
             loss /= light[some, None] + light[near]
@@ -271,7 +274,7 @@ def _nearest_entries(
     """[m] i64, the nearest entry of each point, among those near its group."""
     labels = np.zeros(len(points), np.int64)
     for members, near in _neighbourhoods(groups, homes, centres):
-        for part in _parts(len(members), max(_BLOCK // len(near), 1)):
+        for part in blocks(len(members), max(_BLOCK // len(near), 1)):
             some = members[part]
             labels[some] = near[_closest(points[some], entries[near])]
     return labels
@@ -314,7 +317,7 @@ def _closest(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """[m] i64, the nearest centre of each point, by exact products."""
     half = np.einsum("ij,ij->i", centres, centres) / 2
     labels = np.empty(len(points), np.int64)
-    for part in _parts(len(points), max(_BLOCK // len(centres), 1)):
+    for part in blocks(len(points), max(_BLOCK // len(centres), 1)):
         labels[part] = (points[part] @ centres.T - half).argmax(axis=1)
     return labels
 
@@ -328,8 +331,3 @@ def _means(points: np.ndarray, weights: np.ndarray, labels: np.ndarray, before: 
         sums = np.bincount(labels, weights * points[:, channel].astype(np.float64), minlength=len(before))
         means[some, channel] = np.rint(sums[some] / heavy[some])
     return means
-
-
-def _parts(count: int, rows: int = 65536) -> Iterator[slice]:
-    for start in range(0, count, rows):
-        yield slice(start, min(start + rows, count))

@@ -309,11 +309,6 @@ def possible_forms(info: DeviceInfo) -> list[Form]:
     return sorted(forms, key=lambda form: form != likely_form(info))
 
 
-def with_written_fma(form: Form) -> Form:
-    """`form` with `fma` written out."""
-    return replace(form, written_fma=True)
-
-
 @cache
 def prepare_compiler_cache() -> None:
     """Name another folder if PoCL's cannot be written, and remove its damaged entries, once in a process."""

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from flexgs_edge.errors import BudgetError, DeviceError
-from flexgs_edge.kernels.choose_device import DeviceInfo, Form, list_devices, possible_forms, probed, with_written_fma
+from flexgs_edge.kernels.choose_device import DeviceInfo, Form, list_devices, possible_forms, probed
 from flexgs_edge.kernels.opencl import OpenCLBackend
 from flexgs_edge.kernels.self_test import first_words, load_record, verdict
 from flexgs_edge.kernels.tested import FORM, MARK, Verdict
@@ -44,7 +44,7 @@ def measure_forms(
     failed = ""
     written = False
     for number, form in enumerate(possible_forms(info)):
-        both = [form, with_written_fma(form)]
+        both = [form, replace(form, written_fma=True)]
         # What is faster for the first form is so for all; building the slow ones takes long.
         chosen = both if number == 0 or not found else [both[written]]
         tried = chosen if may_write_fma(info) else both[:1]

@@ -135,7 +135,10 @@ class ScratchStorage(Storage):
             return np.empty(shape, dtype)
         file = self.file()
         try:
-            _reserve(file.fileno(), size)
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:  # no blocks can be reserved
+                os.ftruncate(file.fileno(), size)
             held = MappedFile(file.fileno(), size)
         except OSError as error:
             file.close()
@@ -167,14 +170,6 @@ class ScratchStorage(Storage):
                 f"are needed and {size_free} are free; free some space, or name another folder with --scratch"
             )
         return BudgetError(f"{self.folder}: the disk is full ({error.strerror})")
-
-
-def _reserve(descriptor: int, size: int) -> None:
-    """Reserve the blocks of a file; if the system cannot, only set its size."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(descriptor, 0, size)
-    else:
-        os.ftruncate(descriptor, size)
 
 
 def file_system_of(folder: Path, mounts: str | Path = "/proc/self/mounts") -> str | None:

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from math import log2
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import DEFAULT_BASE_PSNR
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.target import Covered, Measurement, Target
+from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.progress import SILENT, Progress
 from flexgs_edge.quality.psnr import contrast, exposure_gains, far_bases, lone_base, moved_error, mse, with_gains
 from flexgs_edge.quality.similarity import flip_bytes, flip_maps, flips, ssim_bytes, ssims
@@ -30,6 +33,8 @@ LIBRARY_BYTES = 12 * 2**20
 WORK_BYTES = 100
 """Bound on the bytes per pixel while a photo is decoded, or SSIM or FLIP is computed, with the backend's buffers."""
 CHECK_ROWS = 1 << 18  # Rows whose opacity is read at a time, where no view sees any Gaussian
+_Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
+_Found = TypeVar("_Found")
 ESTIMATE_STEP = 2  # An estimate reads every second pixel in both directions
 
 
@@ -126,10 +131,7 @@ class QualityEvaluator:
 
     def _nothing_seen(self) -> InputError:
         source = self.source
-        logits = (
-            source.read(slice(start, min(start + CHECK_ROWS, source.count)), ["opacity_logits"])["opacity_logits"]
-            for start in range(0, source.count, CHECK_ROWS)
-        )
+        logits = (source.read(rows, ["opacity_logits"])["opacity_logits"] for rows in source.chunks(CHECK_ROWS))
         if not any(alive(part[0]).any() for part in logits):
             return invisible(source)
         placed = "" if self._automatic else f", let them be placed (--cameras {AUTO_CAMERAS})"
@@ -202,7 +204,7 @@ class QualityEvaluator:
         known = self._known.get(drawn) if drawn is not None else None
         if known is not None and (known.worst_flip or not flip):
             return known
-        ssims, flips = self._ssims if with_ssim else None, self._flips if flip else None
+        by_ssim, by_flip = partial(self._measured, ssim_bytes, ssims), partial(self._measured, flip_bytes, flips)
         found: list[ViewQuality] = []
         images = (self.renderer.render(scene, camera) for camera in self.renderer.in_turn(scene, self.cameras))
         for i, image in enumerate(progress.track(images, "comparing views", len(self.cameras))):
@@ -210,11 +212,12 @@ class QualityEvaluator:
             original = self.original(i)
             references = original, self._photo(i, original)
             if known is not None:
-                found.append(with_flip(known.views[i], image, *references, self._flips))
+                found.append(with_flip(known.views[i], image, *references, by_flip))
                 continue
             name, coverage = self.cameras[i].name, self._coverage[i]
-            found.append(compare_view(name, image, *references, error, similar, ssims, lpips, coverage, flips))
-            if ssims:
+            own = by_ssim if with_ssim else None, by_flip if flip else None
+            found.append(compare_view(name, image, *references, error, similar, own[0], lpips, coverage, own[1]))
+            if with_ssim:
                 self._original_ssim[i] = found[-1].original_ssim
             found[-1] = self._as_counted(found[-1], i)
         made = None if known is None else known.made
@@ -263,21 +266,17 @@ class QualityEvaluator:
             self._coarse_error[i] = mse(original, photo)
         return original, photo, self._coarse_error[i]
 
-    def _ssims(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+    def _measured(
+        self, needed: Callable[[int, int], int], measure: Callable[[Backend, _Pairs], list[_Found]], pairs: _Pairs
+    ) -> list[_Found]:
+        """What `measure` finds on the backend, with the bytes that it needs for pictures of this width and height."""
         height, width = pairs[0][0].shape[:2]
-        with self._lent(ssim_bytes(width, height)):
-            return ssims(self.renderer.backend, pairs)
-
-    def _flips(self, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
-        height, width = pairs[0][0].shape[:2]
-        with self._lent(flip_bytes(width, height)):
-            return flips(self.renderer.backend, pairs)
+        with self._lent(needed(width, height)):
+            return measure(self.renderer.backend, pairs)
 
     def flip_map(self, image: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """FLIP at every pixel of two [H, W, 3] images: [H, W] f32, 0 to 1."""
-        height, width = image.shape[:2]
-        with self._lent(flip_bytes(width, height)):
-            return flip_maps(self.renderer.backend, [(image, reference)])[0]
+        return self._measured(flip_bytes, flip_maps, [(image, reference)])[0]
 
     @contextmanager
     def _lent(self, wanted: int) -> Iterator[None]:

@@ -104,7 +104,7 @@ class _Points:
             self._convert(folder / f"scene{suffix}", unpruned)
         order = ("best", "paper")
         self.rows.sort(key=lambda row: order.index(str(row["method"])) if row["method"] in order else len(order))
-        table = written.Table(written.columns(**HEADS), tuple(self.rows))
+        table = written.Table(HEADS, tuple(self.rows))
         made = [_rate(table, self.missing, self.options.effort)]
         if table.rows[-1]["drop"] is not None:
             made.append(_fidelity(table))
@@ -201,10 +201,8 @@ def _rate(table: written.Table, missing: Sequence[str], effort: str) -> written.
 def _fidelity(table: written.Table) -> written.Experiment:
     """Compare all methods by bytes and fidelity to the original's renders, for scenes that photos decide."""
     names = ("method", "wanted_ratio", "size", "ratio", "fidelity")
-    own = written.Table(
-        written.columns(**{name: HEADS[name] for name in names}),
-        tuple({name: row[name] for name in names} for row in table.rows),
-    )
+    rows = tuple({name: row[name] for name in names} for row in table.rows)
+    own = written.Table({name: HEADS[name] for name in names}, rows)
     best = [row for row in own.rows if row["method"] == "best"]
     return written.Experiment(
         "fidelity",

@@ -14,6 +14,17 @@ from flexgs_edge.run.quality_evaluator import measurement_of
 from flexgs_edge.studies import written
 
 PRESETS = (("paper", "balanced"), ("best", "fast"), ("best", "balanced"))  # Method and effort of each run
+HEADS = {
+    "method": "method",
+    "effort": "effort",
+    "seconds": "seconds",
+    "search_seconds": "of them, search",
+    "steps": "results measured",
+    **written.FIGURES,
+    "kept": "Gaussians kept",
+    "reached": "target met",
+    "front": "on the front",
+}
 
 
 def study_speed(
@@ -52,20 +63,7 @@ def _study(path: str | Path, options: CompressOptions, progress: Progress) -> wr
     best = front([written.number(row, "seconds") for row in rows], [written.number(row, "ratio") for row in rows])
     for row, on in zip(rows, best):
         row["front"] = on
-    table = written.Table(
-        written.columns(
-            method="method",
-            effort="effort",
-            seconds="seconds",
-            search_seconds="of them, search",
-            steps="results measured",
-            **written.FIGURES,
-            kept="Gaussians kept",
-            reached="target met",
-            front="on the front",
-        ),
-        tuple(rows),
-    )
+    table = written.Table(HEADS, tuple(rows))
     experiment = written.Experiment(
         "presets",
         "Time of a whole run and the ratio that it finds",

@@ -118,7 +118,7 @@ def study_stability(
 def held_out(found: dict[str, CompressResult]) -> written.Experiment:
     """Compare the methods by the mean and the worst of the held-out views."""
     rows = [_view_row(name, result) for name, result in found.items()]
-    table = written.Table(written.columns(**VIEW_HEADS), tuple(rows))
+    table = written.Table(VIEW_HEADS, tuple(rows))
     figure = "modelled_drop" if rows[0]["drop"] is None else "drop"
     return written.Experiment(
         "heldout",
@@ -279,7 +279,7 @@ def _by_distance(rows: list[dict[str, written.Cell]], base: float) -> written.Ex
         "distance",
         "Nearer and farther",
         "Held-out poses are moved along their axes, to so many times the distance of the middle of the frame. " + _LOOK,
-        written.Table(written.columns(**POSE_HEADS), tuple(rows)),
+        written.Table(POSE_HEADS, tuple(rows)),
         LineChart(
             "Poses nearer and farther than the scored ones",
             "distance to the scene, times",
@@ -311,7 +311,7 @@ def _below(row: written.Row) -> str:
 
 
 def _by_kind(rows: list[dict[str, written.Cell]]) -> written.Experiment:
-    table = written.Table(written.columns(**POSE_HEADS), tuple(rows))
+    table = written.Table(POSE_HEADS, tuple(rows))
     kinds = [kind for kind in dict.fromkeys((row["poses"], row["amount"]) for row in rows) if kind[0] != TRAINING]
     findings = []
     for name in METHODS:

@@ -45,28 +45,21 @@ def figures(size: int, ply_bytes: int, found: Measurement) -> dict[str, Cell]:
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of a table."""
-
-    name: str  # key in the rows, in CSV and in JSON
-    head: str  # head on the page, with the unit
-
-
-@dataclass(frozen=True)
 class Table:
     """The measurements of an experiment. Every row holds exactly the columns, in their order.
 
     Numbers are rounded when rows are made, so that CSV, JSON, page and charts show the same ones.
     """
 
-    columns: tuple[Column, ...]
+    columns: Mapping[str, str]  # heads on the page, with units, by the keys in rows, CSV and JSON
     rows: tuple[Row, ...]
 
     def __post_init__(self) -> None:
-        names = [column.name for column in self.columns]
         for number, row in enumerate(self.rows):
-            if list(row) != names:
-                raise ValueError(f"row {number}: expected the columns {', '.join(names)}, found {', '.join(row)}")
+            if list(row) != list(self.columns):
+                raise ValueError(
+                    f"row {number}: expected the columns {', '.join(self.columns)}, found {', '.join(row)}"
+                )
 
     def values(self, column: str, **where: Cell) -> list[Any]:
         """Cells of `column` in the rows whose other cells equal those in `where`."""
@@ -76,18 +69,13 @@ class Table:
         """CSV in UTF-8 with a head line and LF. None is an empty cell, and floats read back exactly."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(column.name for column in self.columns)
+        writer.writerow(self.columns)
         writer.writerows(map(_csv_cell, row.values()) for row in self.rows)
         return text.getvalue().encode()
 
     def words(self) -> list[list[str]]:
         """The rows' cells as people read them."""
         return [[_words(cell) for cell in row.values()] for row in self.rows]
-
-
-def columns(**heads: str) -> tuple[Column, ...]:
-    """Columns from `name="head"`."""
-    return tuple(Column(name, head) for name, head in heads.items())
 
 
 def number(row: Row, column: str) -> float:
@@ -134,7 +122,7 @@ class Experiment:
             "title": self.title,
             "question": self.question,
             "timed": self.timed,
-            "columns": {column.name: column.head for column in self.table.columns},
+            "columns": dict(self.table.columns),
             "rows": [dict(row) for row in self.table.rows],
             "findings": list(self.findings),
         }

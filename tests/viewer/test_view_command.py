@@ -114,7 +114,7 @@ def test_views_to_look_through_are_placed_from_a_sample(tmp_path: Path, monkeypa
     write_ply(tmp_path / "scene.ply", make_scene(200, 1))
     counts: list[int] = []
     monkeypatch.setattr(run_module, "USUAL_COUNT", 50)
-    monkeypatch.setattr(run_module, "find_views", lambda _, __, source, *rest: counts.append(source.count))
+    monkeypatch.setattr(run_module.view_set, "find_views", lambda _, __, source, *rest: counts.append(source.count))
     for decodes in (True, False):
         open_run(tmp_path / "scene.ply", ViewOptions(), decodes=decodes)
     assert counts == [200, 50]

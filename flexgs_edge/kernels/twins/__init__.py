@@ -4,23 +4,12 @@ The twins are the specification of the kernels. `--device numpy` runs them; they
 """
 
 from collections.abc import Callable
+from importlib import import_module
 
 from flexgs_edge.kernels.backend import KERNELS
-from flexgs_edge.kernels.twins import (
-    activate,
-    backward,
-    blend,
-    dequantize,
-    descend,
-    flip,
-    project,
-    score,
-    similarity,
-    sort,
-    tiles,
-)
 
-_FILES = (activate, backward, blend, dequantize, descend, flip, project, score, similarity, sort, tiles)
+# The twins of a kernel file lie in the module of its name; forms of a kernel share one.
+_MODULES = {name: spec.file.removesuffix(".cl").removesuffix("_{form}") for name, spec in KERNELS.items()}
 TWINS: dict[str, Callable[..., None]] = {
-    name: getattr(file, name) for file in _FILES for name in KERNELS if hasattr(file, name)
+    name: getattr(import_module(f"{__name__}.{module}"), name) for name, module in _MODULES.items()
 }

@@ -4,41 +4,25 @@ import math
 
 import numpy as np
 
-from flexgs_edge.constants import (
-    CULLED,
-    EXTENT_SLACK,
-    LOG2_255,
-    LOG2_E,
-    MOST_NUMBERED,
-    ROW_BLOCK,
-    SH_C0,
-    SH_C1,
-    SH_C2,
-    SH_C3,
-    SH_C4,
-    SHARE_MIN,
-    SPAN_SLACK,
-    SPAN_SLACK_RELATIVE,
-    TILE,
-)
+from flexgs_edge import constants
 from flexgs_edge.kernels.twins.arithmetic import Array, Size, Triple, dot3, f32, flog2, fma
 from flexgs_edge.kernels.twins.tiles import only_tiles
 
-_LOG2_E = f32(LOG2_E)
+_LOG2_E = f32(constants.LOG2_E)
 
 
 def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
     """Basis functions above degree 0 in unit directions (x, y, z), in the written forms of project.cl."""
     basis: list[Array] = []
     if degree > 0:
-        c1 = f32(SH_C1)
+        c1 = f32(constants.SH_C1)
         basis += [-c1 * y, c1 * z, -c1 * x]
     if degree > 1:
         xx, yy, zz = x * x, y * y, z * z
-        c2 = [f32(c) for c in SH_C2]
+        c2 = [f32(c) for c in constants.SH_C2]
         basis += [c2[0] * (x * y), c2[1] * (y * z), c2[2] * ((zz + zz) - (xx + yy)), c2[3] * (x * z), c2[4] * (xx - yy)]
     if degree > 2:
-        c3 = [f32(c) for c in SH_C3]
+        c3 = [f32(c) for c in constants.SH_C3]
         three, four = f32(3), f32(4)
         basis += [
             c3[0] * (y * (three * xx - yy)),
@@ -50,7 +34,7 @@ def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
             c3[6] * (x * (xx - three * yy)),
         ]
     if degree > 3:
-        c4 = [f32(c) for c in SH_C4]
+        c4 = [f32(c) for c in constants.SH_C4]
         one, three, seven = f32(1), f32(3), f32(7)
         basis += [
             c4[0] * ((x * y) * (xx - yy)),
@@ -68,15 +52,15 @@ def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
 
 def block_rows(blocks: Array, first: int, count: int) -> Array:
     """[count] i64, the rows of a chunk in its part of a view: those of `blocks` from place `first` on."""
-    some = blocks[first : first - (-count // ROW_BLOCK)].astype(np.int64)
-    return (some[:, None] * ROW_BLOCK + np.arange(ROW_BLOCK)).reshape(-1)[:count]
+    some = blocks[first : first - (-count // constants.ROW_BLOCK)].astype(np.int64)
+    return (some[:, None] * constants.ROW_BLOCK + np.arange(constants.ROW_BLOCK)).reshape(-1)[:count]
 
 
 def _bounds(mx: Array, my: Array, half: tuple[Array, Array], cam: Array) -> tuple[Array, Array, Array, Array]:
     """Number of tiles of the bounding box, whether there are any, and column and row of the first one."""
-    per_tile, spans = f32(1.0 / TILE), []
+    per_tile, spans = f32(1.0 / constants.TILE), []
     for centre, half_extent, slack_factor, pixels in ((mx, half[0], f32(2), cam[24]), (my, half[1], f32(1), cam[25])):
-        slack = slack_factor * fma(half_extent, f32(SPAN_SLACK_RELATIVE), f32(SPAN_SLACK))
+        slack = slack_factor * fma(half_extent, f32(constants.SPAN_SLACK_RELATIVE), f32(constants.SPAN_SLACK))
         first = np.floor(np.ceil(centre - half_extent - slack) * per_tile)
         last = np.floor(np.floor(centre + half_extent + slack) * per_tile)
         first = np.fmax(first, f32(0))
@@ -138,12 +122,12 @@ def project(
 
     if antialiased:
         a, b, c, det, share = _from_factor(cov[:, own], t0, t1, cam[26])
-        shown &= share >= f32(SHARE_MIN)
-        level = fma(f32(0.5), flog2(np.where(share > f32(SHARE_MIN), share, f32(SHARE_MIN))), level)
-        shown &= level >= -(f32(LOG2_255) + f32(EXTENT_SLACK))
+        shown &= share >= f32(constants.SHARE_MIN)
+        level = fma(f32(0.5), flog2(np.where(share > f32(constants.SHARE_MIN), share, f32(constants.SHARE_MIN))), level)
+        shown &= level >= -(f32(constants.LOG2_255) + f32(constants.EXTENT_SLACK))
     else:
         a, b, c, det = _from_covariance(cov[:, own], t0, t1, cam[26])
-    t2 = np.fmax((level + (f32(LOG2_255) + f32(EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
+    t2 = np.fmax((level + (f32(constants.LOG2_255) + f32(constants.EXTENT_SLACK))) * (f32(2) / _LOG2_E), f32(0))
     half = (np.sqrt(t2 * a), np.sqrt(t2 * c))
     shown &= (det > 0) & (det < np.inf) & (a < np.inf) & (c < np.inf)
     shown &= (mx + half[0] >= f32(-1)) & (mx - half[0] <= cam[24])
@@ -157,7 +141,7 @@ def project(
     out = np.zeros((count, 16), f32)
     fields = (mx, my, c * k, -(b + b) * k, a * k, level), ((b / a) * half[0], half[1], b * ic, ic, det * ic, t2)
     out[:, :6], out[:, 9:15] = np.stack(fields[0], axis=1), np.stack(fields[1], axis=1)
-    if math.prod(-(-int(pixels) // TILE) for pixels in cam[24:26]) <= MOST_NUMBERED:
+    if math.prod(-(-int(pixels) // constants.TILE) for pixels in cam[24:26]) <= constants.MOST_NUMBERED:
         one = np.flatnonzero(shown & (tiles == 1))
         words = only_tiles(out[one], column[one], row[one], cam[24])
         out[one, 15] = words.view(f32)
@@ -165,7 +149,7 @@ def project(
     rows = np.flatnonzero(shown)
     out[rows, 6:9] = np.stack(_colours(rows, degree, cam, (px, py, pz), sh_dc[:, own], sh_rest[:, own]), axis=1)
     records[base + rows] = out[rows]
-    keys[base : base + count] = np.where(shown, z.view(np.uint32), np.uint32(CULLED))
+    keys[base : base + count] = np.where(shown, z.view(np.uint32), np.uint32(constants.CULLED))
     bounds[base : base + count] = np.where(shown, tiles, 0).astype(np.uint32)
 
 
@@ -177,7 +161,7 @@ def _colours(
     basis = sh_basis(degree, dx * norm, dy * norm, dz * norm)
     colours = []
     for channel in range(3):
-        colour = f32(SH_C0) * sh_dc[channel, rows]
+        colour = f32(constants.SH_C0) * sh_dc[channel, rows]
         for k, function in enumerate(basis):
             colour = fma(function, sh_rest[channel * len(basis) + k, rows], colour)
         colours.append(np.fmax(colour + f32(0.5), f32(0)))

@@ -70,7 +70,9 @@ def probe_slopes(
             put_rows(moved[field], rows, _on_trial_grid(part, kind, np.float32(trial[kind])))
         with renderer.load(MemorySource(moved, origin=origin)) as scene:
             images = map(partial(renderer.render, scene), renderer.in_turn(scene, views))
-            error = sum(_squared_error(image, drawn) for image, drawn in zip(images, reference, strict=True))
+            pairs = zip(images, reference, strict=True)
+            errors = (np.square(image - drawn.astype(np.float32), dtype=np.float64) for image, drawn in pairs)
+            error = sum(float(squares.sum()) for squares in errors)
         per_row[kind] = error * len(cameras) / len(views) / (count * trial[kind] ** 2)
     return Slopes(per_row)
 
@@ -97,11 +99,6 @@ def _on_trial_grid(planes: dict[str, np.ndarray], kind: str, step: np.float32) -
         moved: np.ndarray = (planes["means"] + turned(planes["quats"], errors)).astype(np.float32)
         return moved
     return (np.rint(planes["opacity_logits"] / step) * step).astype(np.float32)
-
-
-def _squared_error(image: np.ndarray, reference: np.ndarray) -> float:
-    difference = image - reference.astype(np.float32)
-    return float(np.square(difference, dtype=np.float64).sum())
 
 
 def choose_steps(

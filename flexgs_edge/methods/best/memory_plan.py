@@ -20,23 +20,8 @@ from flexgs_edge.methods.best.refit.descent import descent_bytes
 from flexgs_edge.methods.best.refit.streamed_descent import streamed_descent_bytes, streamed_rows
 from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row_bytes
 from flexgs_edge.progress import LOG
+from flexgs_edge.render import fit as needs
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
-from flexgs_edge.render.fit import (
-    DEFAULT,
-    GRADIENT_SUMS,
-    MOST_SUMS,
-    Fit,
-    ViewSize,
-    compact_bytes,
-    padded,
-    plane_bytes,
-    reference_bytes,
-    shapes_bytes,
-    streamed_bytes,
-    structure_shapes,
-    sum_bytes,
-    view_bytes,
-)
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.open_renderer import drawing_bytes, shown_rows, size_of
@@ -56,12 +41,12 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
     cameras = run.seen.of(run.seen.train)
     size = size_of(largest_of(cameras))  # poses of large weight keep all their pixels
     distils = finetune_steps(options, len(cameras), source.count) > 0
-    held = sum(needed_bytes(DEFAULT, size, source, len(cameras), options, distils))
+    held = sum(needed_bytes(needs.DEFAULT, size, source, len(cameras), options, distils))
     if run.output.format is not None:
         return held
-    pruning = spilled_bytes(DEFAULT, source, size, shown_rows(run), False)
-    few = -(-source.count // DEFAULT.first_share)  # descents begin once many rows went
-    descent = spilled_bytes(DEFAULT, source, size, few, distils)
+    pruning = spilled_bytes(needs.DEFAULT, source, size, shown_rows(run), False)
+    few = -(-source.count // needs.DEFAULT.first_share)  # descents begin once many rows went
+    descent = spilled_bytes(needs.DEFAULT, source, size, few, distils)
     view = max(pruning, descent, drawing_bytes(run))
     return min(held, READING_BYTES + SPILLED_ROW_BYTES * source.count + view)
 
@@ -114,7 +99,7 @@ def choose_storage(run: Run[CompressOptions], renderer: Renderer, scored: Sequen
 
 
 def needed_bytes(
-    fit: Fit, size: ViewSize, source: SceneSource, poses: int, options: CompressOptions, distils: bool
+    fit: needs.Fit, size: needs.ViewSize, source: SceneSource, poses: int, options: CompressOptions, distils: bool
 ) -> tuple[int, int]:
     """Bytes that a search with so many scored poses holds in memory, and the least bytes that drawing needs beside them."""
     held, sums = (
@@ -123,7 +108,7 @@ def needed_bytes(
     )
     if distils:
         # A descent holds all kept rows at once, with their gradients. That is the whole scene at most.
-        sums = max(sums, descent_bytes(source.sh_degree) + plane_bytes(source.sh_degree))
+        sums = max(sums, descent_bytes(source.sh_degree) + needs.plane_bytes(source.sh_degree))
         # The values of all descents take at most three copies of the scene's planes: a strict target keeps more rows, but needs
         # fewer candidates: docs/results/tuning.md#descents
         held += source.count * 3 * stored_bytes(source.sh_degree)
@@ -141,26 +126,28 @@ def least_spilled(renderer: Renderer, source: SceneSource, largest: Camera, dist
     return spilled_bytes(renderer.fit, source, view_size(renderer.backend, largest), shown, distils)
 
 
-def spilled_bytes(fit: Fit, source: SceneSource, size: ViewSize, shown: int, distils: bool) -> int:
+def spilled_bytes(fit: needs.Fit, source: SceneSource, size: needs.ViewSize, shown: int, distils: bool) -> int:
     """Bytes that a view needs in a search in scratch files if it has room for `shown` rows."""
     degree = source.sh_degree
 
     def least(rows: int, sums: int) -> int:
-        return compact_bytes(size, shown, rows, degree) + reference_bytes(size) + sum_bytes(sums) * shown
+        return (
+            needs.compact_bytes(size, shown, rows, degree) + needs.reference_bytes(size) + needs.sum_bytes(sums) * shown
+        )
 
-    pruning = least(min(fit.compact_rows, source.count), MOST_SUMS)
+    pruning = least(min(fit.compact_rows, source.count), needs.MOST_SUMS)
     if not distils:
         return pruning
     rows = streamed_rows(fit, source.count)
-    structure = shapes_bytes(structure_shapes(size))
-    return max(pruning, least(rows, GRADIENT_SUMS) + structure + streamed_descent_bytes(degree, rows))
+    structure = needs.shapes_bytes(needs.structure_shapes(size))
+    return max(pruning, least(rows, needs.GRADIENT_SUMS) + structure + streamed_descent_bytes(degree, rows))
 
 
-def _least_bytes(fit: Fit, size: ViewSize, source: SceneSource, sum_bytes: int, structure: bool) -> int:
-    """Least bytes that a view of `source` needs, with its reference and sums of `sum_bytes` a row; nothing is loaded yet."""
-    chunk = padded(min(fit.least_rows, source.count)) * streamed_bytes(source.sh_degree)
-    target = reference_bytes(size) + (shapes_bytes(structure_shapes(size)) if structure else 0)
-    return view_bytes(size, source.count) + target + sum_bytes * source.count + chunk
+def _least_bytes(fit: needs.Fit, size: needs.ViewSize, source: SceneSource, sums: int, structure: bool) -> int:
+    """Least bytes that a view of `source` needs, with its reference and `sums` bytes of sums a row; nothing is loaded yet."""
+    chunk = needs.padded(min(fit.least_rows, source.count)) * needs.streamed_bytes(source.sh_degree)
+    target = needs.reference_bytes(size) + (needs.shapes_bytes(needs.structure_shapes(size)) if structure else 0)
+    return needs.view_bytes(size, source.count) + target + sums * source.count + chunk
 
 
 def stored_bytes(sh_degree: int) -> int:
