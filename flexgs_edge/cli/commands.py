@@ -12,8 +12,7 @@ from flexgs_edge.report.run_info import Result
 
 @click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="INPUT", type=click.Path())
-@help_page.option(
-    help_page.OUTPUT,
+@help_page.output_option(
     "-o",
     "--output",
     metavar="OUT",
@@ -23,23 +22,20 @@ from flexgs_edge.report.run_info import Result
 )
 @shared_options.positions_options
 @shared_options.writing_options
-@help_page.option(
-    help_page.OUTPUT,
+@help_page.output_option(
     "--double",
     is_flag=True,
     help="Write x y z of a .ply as doubles, which not every program reads. Default: the type that came in. A .fgs does not keep "
     "it: floats, unless they would ruin a scene far from zero.",
 )
-@help_page.option(
-    help_page.VIEWS,
+@help_page.views_option(
     "--cameras",
     metavar="PATH",
     help="Cameras of the pictures that show what another program's format loses. none: no pictures. Default: cameras beside "
     "the scene, else generated views (with --device numpy: none).",
 )
 @shared_options.reading_options
-@help_page.option(
-    help_page.DEVICE,
+@help_page.device_option(
     "--device",
     metavar="SPEC",
     help="Device that draws the compared pictures; an OpenCL CPU also decodes a large .fgs of --method best. Its number, part "
@@ -116,13 +112,9 @@ def info(file: str, crop: str | None) -> Result:
 
 @click.command(cls=help_page.SectionCommand)
 @click.argument("input", metavar="IN.fgs", type=click.Path())
-@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
-@help_page.option(
-    help_page.OUTPUT,
-    "--max-size",
-    type=value_types.SIZE,
-    required=True,
-    help="Largest size of the new file, such as 800kB or 1MiB.",
+@help_page.output_option("-o", "--output", metavar="OUT.fgs", required=True, help="File to write.")
+@help_page.output_option(
+    "--max-size", type=value_types.SIZE, required=True, help="Largest size of the new file, such as 800kB or 1MiB."
 )
 @shared_options.write_options
 @talk.told
@@ -171,18 +163,11 @@ def verify(file: str, force: bool, json_path: str | None, quiet: bool) -> None:
 
 
 @click.command(cls=help_page.SectionCommand)
-@help_page.option(
-    help_page.DEVICE,
-    "--device",
-    metavar="SPEC",
-    help="Say which device this would choose: a number, part of a name, cpu or gpu.",
+@help_page.device_option(
+    "--device", metavar="SPEC", help="Say which device this would choose: a number, part of a name, cpu or gpu."
 )
-@help_page.option(
-    help_page.DEVICE,
-    "--self-test",
-    "self_test",
-    is_flag=True,
-    help="Test every device anew, also those with a verdict.",
+@help_page.device_option(
+    "--self-test", "self_test", is_flag=True, help="Test every device anew, also those with a verdict."
 )
 @shared_options.write_options
 def devices(device: str | None, self_test: bool, force: bool, json_path: str | None, quiet: bool) -> None:
@@ -210,29 +195,24 @@ def devices(device: str | None, self_test: bool, force: bool, json_path: str | N
 
 @click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@help_page.option(
-    help_page.OUTPUT,
+@help_page.output_option(
     "-o",
     "--output",
     metavar="PAGE.html|FOLDER",
     help="Write one file that opens from disk, without a network, or the folder of a web site. "
     "Default: serve the scene until Ctrl-C.",
 )
-@help_page.option(
-    help_page.OUTPUT, "--browser/--no-browser", default=True, help="Open the page in the browser. Default: open it."
+@help_page.output_option("--browser/--no-browser", default=True, help="Open the page in the browser. Default: open it.")
+@help_page.output_option(
+    "--port", metavar="N", type=int, default=0, show_default="any free", help="Port of the server."
 )
-@help_page.option(
-    help_page.OUTPUT, "--port", metavar="N", type=int, default=0, show_default="any free", help="Port of the server."
-)
-@help_page.option(
-    help_page.OUTPUT,
+@help_page.output_option(
     "--host",
     metavar="ADDRESS",
     default="127.0.0.1",
     help="Address of the server. Others than the default let other machines see the scene.",
 )
-@help_page.option(
-    help_page.OUTPUT,
+@help_page.output_option(
     "--notes",
     metavar="FILE.json",
     help='Show texts at places of the scene: a list of {"at": [x, y, z], "text": "..."}.',
@@ -291,12 +271,11 @@ def _say(quiet: bool) -> Any:
 
 @click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@help_page.option(
-    help_page.OUTPUT, "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
+@help_page.output_option(
+    "-o", "--output", metavar="DIR", required=True, help="Folder for the PNG files; made if missing."
 )
 @shared_options.cameras_option
-@help_page.option(
-    help_page.VIEWS,
+@help_page.views_option(
     "--views",
     type=value_types.VIEWS,
     help="Views to draw, counted from 0 in order of name: a list such as 0,8,16, or START:STOP:STEP such as 0:50:8. "
@@ -327,7 +306,7 @@ def render(input: str, output: str, views: list[int] | None, force: bool, progre
 
 @click.command(cls=help_page.SectionCommand)
 @shared_options.scene_argument
-@help_page.option(help_page.OUTPUT, "-o", "--output", metavar="SHEET.png", required=True, help="The PNG file.")
+@help_page.output_option("-o", "--output", metavar="SHEET.png", required=True, help="The PNG file.")
 @shared_options.cameras_option
 @shared_options.reading_options
 @shared_options.drawing_options

@@ -4,6 +4,7 @@ Groups of subcommands import a subcommand only to run it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -72,6 +73,10 @@ def option(section: str, *names: str, **kwargs: Any) -> Callable[[Decorated], De
     """Make a `click.option` that appears under a heading. Its default is shown, unless it is a flag or has none."""
     kwargs.setdefault("show_default", not isinstance(kwargs.get("default"), (bool, type(None))))
     return click.option(*names, cls=SectionOption, section=section, **kwargs)
+
+
+input_option, views_option = partial(option, INPUT), partial(option, VIEWS)
+output_option, device_option = partial(option, OUTPUT), partial(option, DEVICE)
 
 
 def stack(*decorators: Callable[[Any], Any]) -> Callable[[Decorated], Decorated]:

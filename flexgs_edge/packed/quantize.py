@@ -98,10 +98,6 @@ class QuantizedScene:
         """Bits per code of every attribute."""
         return BitSpec(**{FIELD[name].bits: array.bits for name, array in self.arrays.items()})
 
-    def rows_of(self, field: str) -> int:
-        """Rows of the array of `field`."""
-        return self.sh_count if field == "sh_rest" else self.count
-
 
 def array_bytes(rows: int, channels: int, bits: int, groups: int) -> int:
     """Exact bytes of a `QuantizedArray`: its codes, and a range of 8 bytes for each group and channel."""

@@ -256,7 +256,7 @@ def test_scene_equals_the_arrays_one_by_one() -> None:
         assert array.planes.tobytes() == expected.planes.tobytes()
         assert array.low.tobytes() == expected.low.tobytes() and array.step.tobytes() == expected.step.tobytes()
     assert (result.count, result.sh_count, result.sh_degree) == (999, 499, 2)
-    assert result.rows_of("sh_rest") == 499 and result.rows_of("means") == 999
+    assert result.arrays["sh_rest"].count == 499 and result.arrays["means"].count == 999
     np.testing.assert_array_equal(result.origin, scene.origin)
 
 

@@ -7,6 +7,7 @@ overhead is paid once a round.
 
 import sys
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,8 +51,6 @@ class Tables:
         np.cumsum(self.freqs[:, :-1], axis=1, out=starts[:, 1:])
         self.entries = ((self.freqs << _SHIFT) | starts).reshape(-1)
         """[t * a] u32, frequency and start of every symbol; 0 if the frequency is 0."""
-        self._slots: np.ndarray | None = None
-        self._moves: np.ndarray | None = None
 
     @property
     def decoding_bytes(self) -> int:
@@ -62,23 +61,19 @@ class Tables:
     def _kind(self) -> np.dtype[Any]:
         return np.dtype(np.uint8 if self.size <= 256 else np.uint16)
 
-    @property
+    @cached_property
     def slots(self) -> np.ndarray:
         """[t * 2^14], the symbol of every slot of every table."""
-        if self._slots is None:
-            symbols = np.tile(np.arange(self.size, dtype=self._kind), len(self.freqs))
-            self._slots = np.repeat(symbols, self.freqs.reshape(-1))
-        return self._slots
+        symbols = np.tile(np.arange(self.size, dtype=self._kind), len(self.freqs))
+        return np.repeat(symbols, self.freqs.reshape(-1))
 
-    @property
+    @cached_property
     def moves(self) -> np.ndarray:
         """[t * 2^14] u32, for every slot the frequency of its symbol and the slot's place in it: one look-up a decoded symbol."""
-        if self._moves is None:
-            freqs = self.freqs.reshape(-1)
-            moves = np.repeat((freqs << _SHIFT) - (self.entries & _LOW), freqs)
-            moves.reshape(-1, TOTAL)[:] += np.arange(TOTAL, dtype=np.uint32)
-            self._moves = moves
-        return self._moves
+        freqs = self.freqs.reshape(-1)
+        moves = np.repeat((freqs << _SHIFT) - (self.entries & _LOW), freqs)
+        moves.reshape(-1, TOTAL)[:] += np.arange(TOTAL, dtype=np.uint32)
+        return moves
 
     def bits(self, tables: np.ndarray, symbols: np.ndarray) -> float:
         """Information of symbols in bits; in floating point, so for reports only."""
@@ -90,7 +85,7 @@ class Encoder:
 
     def __init__(self, lanes: int) -> None:
         self.lanes = lanes
-        self._batches: list[np.ndarray] = []
+        self.batches: list[np.ndarray] = []  # frequency and start of every symbol ([m] u32), batch by batch
 
     def put(self, tables: Tables, rows: np.ndarray, symbols: np.ndarray) -> None:
         """Add a batch: `symbols` [m], each with its table `rows` [m] in `tables`. A symbol of frequency 0 is a bug."""
@@ -100,12 +95,7 @@ class Encoder:
         entries = tables.entries.take(place)
         if not entries.all():
             raise AssertionError("a symbol without a frequency")
-        self._batches.append(entries)
-
-    @property
-    def batches(self) -> list[np.ndarray]:
-        """Frequency and start of every symbol ([m] u32), batch by batch."""
-        return self._batches
+        self.batches.append(entries)
 
     def finish(self) -> bytes:
         """Code the stream: the states of all lanes as u32, then the words as u16."""
@@ -115,7 +105,7 @@ class Encoder:
     def _few_lanes(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """States, and words in their order, by Python's integers."""
         states, rounds = [FLOOR] * self.lanes, list[list[int]]()
-        for entries in reversed(self._batches):
+        for entries in reversed(self.batches):
             freqs, starts = (entries >> _SHIFT).tolist(), (entries & _LOW).tolist()
             for at in range((len(freqs) - 1) // self.lanes * self.lanes, -1, -self.lanes):
                 words = []
@@ -136,7 +126,7 @@ class Encoder:
         states = np.full(self.lanes, float(FLOOR))
         quotient, full = np.empty(self.lanes), np.empty(self.lanes, bool)
         words = []
-        for entries in reversed(self._batches):
+        for entries in reversed(self.batches):
             freqs = (entries >> _SHIFT).astype(np.float64)
             starts = (entries & _LOW).astype(np.float64)
             limits, others = freqs * float(1 << 32 - PRECISION), TOTAL - freqs
