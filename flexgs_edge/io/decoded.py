@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexgs_edge.io.frames import Frame
+from flexgs_edge.memory.rows import blocks
 from flexgs_edge.scene.fields import FIELD, OPACITY_LIMIT, sh_rest_count
 from flexgs_edge.scene.source import Planes, Rows, SceneSource, by_chunk
 
@@ -38,8 +39,7 @@ class DecodedSource(SceneSource):
         """See `SceneSource.read`; needs about 4 MB beside the arrays."""
         rows, planes = self.begin_read(rows, fields, out)
         size = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
-        for start in range(0, size, _BLOCK_ROWS):
-            part = slice(start, min(start + _BLOCK_ROWS, size))
+        for part in blocks(size, _BLOCK_ROWS):
             some: Rows = (
                 slice(rows.start + part.start, rows.start + part.stop) if isinstance(rows, slice) else rows[part]
             )

@@ -17,6 +17,7 @@ from flexgs_edge.errors import FormatError, InputError
 from flexgs_edge.files import atomic_write, check_readable
 from flexgs_edge.io import ply_layout
 from flexgs_edge.io.reading import AS_WRITTEN, Reading
+from flexgs_edge.memory.rows import blocks
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.source import Planes, Rows, SceneSource
 
@@ -175,8 +176,7 @@ class _ArrayRows:
         if isinstance(rows, slice):
             yield slice(0, rows.stop - rows.start), self.array[rows]
             return
-        for start in range(0, len(rows), self.block_rows):
-            part = slice(start, min(start + self.block_rows, len(rows)))
+        for part in blocks(len(rows), self.block_rows):
             yield part, self.array[rows[part]]
 
 
@@ -198,11 +198,9 @@ class _FileRows:
                 if _stamp(file) != self.stamp:
                     raise InputError(f"{self.name}: the file was changed after it was opened; start again")
                 block = np.empty(min(size, self.block_rows) * (1 if isinstance(rows, slice) else _SPAN), self.dtype)
-                for start in range(0, size, self.block_rows):
-                    part = slice(start, min(start + self.block_rows, size))
+                for part in blocks(size, self.block_rows):
                     if isinstance(rows, slice):
-                        first = rows.start + start
-                        yield part, self._range(file, first, block[: part.stop - part.start])
+                        yield part, self._range(file, rows.start + part.start, block[: part.stop - part.start])
                     else:
                         yield part, self._list(file, rows[part], block)
         except OSError as error:

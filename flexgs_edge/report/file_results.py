@@ -220,18 +220,16 @@ class DevicesResult(Result):
         return {"devices": [info.to_json() for info in self.devices], "chosen": self.chosen, "reason": self.reason}
 
     def summary(self) -> str:
-        lines = [line for info in self.devices for line in _device_lines(info)]
+        lines = []
+        for info in self.devices:
+            lines += [
+                f"[{info.index}] {info.name}",
+                f"    {info.type}, {info.platform}, driver {info.driver}, {info.opencl_c}",
+                f"    {info.compute_units} compute units, native float vectors of {info.native_width}, work-groups up to "
+                f"{info.max_work_group}, local memory {info.local_bytes // 1024} KiB, global memory "
+                f"{format_mib(info.global_bytes)}, buffers up to {format_mib(info.max_alloc_bytes)}",
+                f"    self-test: {info.self_test}",
+            ]
         if self.chosen is not None:
             lines.append(f"chosen: [{self.chosen}] ({self.reason})")
         return "".join(line + "\n" for line in lines)
-
-
-def _device_lines(info: DeviceInfo) -> list[str]:
-    return [
-        f"[{info.index}] {info.name}",
-        f"    {info.type}, {info.platform}, driver {info.driver}, {info.opencl_c}",
-        f"    {info.compute_units} compute units, native float vectors of {info.native_width}, work-groups up to "
-        f"{info.max_work_group}, local memory {info.local_bytes // 1024} KiB, global memory {format_mib(info.global_bytes)}, "
-        f"buffers up to {format_mib(info.max_alloc_bytes)}",
-        f"    self-test: {info.self_test}",
-    ]

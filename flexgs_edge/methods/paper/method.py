@@ -62,7 +62,14 @@ def score_scene(
     sum(alpha T) (MesonGS). Default: `gs`. Returns [N] f64; -inf for Gaussians that no pose sees. Raises `InputError`
     when no camera sees any Gaussian.
     """
-    statistics = gather_statistics(renderer, scene, cameras, progress)
+    statistics = Statistics.zeros(scene.count)
+    for camera in progress.track(cameras, "scoring views", len(cameras)):
+        renderer.add_statistics(scene, camera, statistics)
+    if not statistics.hits.any():
+        raise InputError(
+            f"none of the {len(cameras)} cameras sees any of the {scene.count} Gaussians: do scene and cameras belong together, "
+            "and is the near plane (--near) in front of the scene?"
+        )
     scores = np.empty(source.count)
     for rows in source.chunks(ROWS):
         part = source.read(rows, ["log_scales", "opacity_logits"])
@@ -73,21 +80,6 @@ def score_scene(
         with np.errstate(divide="ignore"):  # unseen Gaussians get log(0) = -inf
             scores[rows] += np.log(seen.hits.astype(np.float64) if kind == "gs" else seen.weight_sums)
     return scores
-
-
-def gather_statistics(
-    renderer: Renderer, scene: DeviceScene, cameras: Sequence[Camera], progress: Progress = SILENT
-) -> Statistics:
-    """Hits and weights of every Gaussian over `cameras`. Sums are exact, so any order of views gives the same bits."""
-    statistics = Statistics.zeros(scene.count)
-    for camera in progress.track(cameras, "scoring views", len(cameras)):
-        renderer.add_statistics(scene, camera, statistics)
-    if not statistics.hits.any():
-        raise InputError(
-            f"none of the {len(cameras)} cameras sees any of the {scene.count} Gaussians: do scene and cameras belong together, "
-            "and is the near plane (--near) in front of the scene?"
-        )
-    return statistics
 
 
 class ScoreCache:

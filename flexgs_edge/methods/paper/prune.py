@@ -12,6 +12,7 @@ import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.steps import Choice
+from flexgs_edge.memory.rows import blocks
 
 if TYPE_CHECKING:
     from flexgs_edge.scene.source import SceneSource
@@ -63,7 +64,6 @@ def nonzero_sh(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     found = np.zeros(source.count, bool)
     if source.sh_degree == 0:
         return found
-    for start in range(0, source.sh_count, chunk_rows):
-        rows = slice(start, min(start + chunk_rows, source.sh_count))
+    for rows in blocks(source.sh_count, chunk_rows):
         found[rows] = source.read(rows, ("sh_rest",))["sh_rest"].any(axis=0)
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -209,7 +210,7 @@ def descent_bytes(sh_degree: int) -> int:
     return sum_bytes(GRADIENT_SUMS) + 4 * (PLANE_SETS * sum(widths(sh_degree).values()) + 8 + 4)
 
 
-class Descent:
+class Descent(AbstractContextManager["Descent"]):
     """Values of a scene, their gradients, and Adam's running means of these.
 
     After `put_on`, views are drawn from values rounded to their grids, but gradients move the values themselves (the
@@ -334,9 +335,6 @@ class Descent:
             array.release()
         self._parts, self._arrays = [], []
         self._scene.close()
-
-    def __enter__(self) -> Descent:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -6,6 +6,7 @@ The values are those of `Descent`, bit for bit: a step changes no row that its v
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -156,7 +157,7 @@ def streamed_descent_bytes(sh_degree: int, rows: int) -> int:
     return padded(rows) * (own + 2 * (4 * RECORD + sum_bytes(GRADIENT_SUMS)))
 
 
-class StreamedDescent:
+class StreamedDescent(AbstractContextManager["StreamedDescent"]):
     """As `Descent`, with all state in scratch files.
 
     A step draws its view chunk by chunk, and then moves the chunks of which it shows something. A mean follows the values of the
@@ -368,9 +369,6 @@ class StreamedDescent:
             array.release()
         self._arrays, self._parts = [], []
         self._scene.close()
-
-    def __enter__(self) -> StreamedDescent:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
