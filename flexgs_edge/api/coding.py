@@ -1,7 +1,5 @@
 """Compress scenes to files or bytes, and decode them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 import weakref
@@ -38,7 +36,7 @@ def compress(
     *,
     cameras: Sequence[Camera] | StrPath | None = None,
     images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
-    **words: Unpack[CompressWords],
+    **words: "Unpack[CompressWords]",
 ) -> CompressResult:
     """Compress a scene to the smallest file that meets a target.
 
@@ -104,7 +102,7 @@ def encode(
     *,
     cameras: Sequence[Camera] | StrPath | None = None,
     images: StrPath | Sequence[NDArray[np.uint8]] | None = None,
-    **words: Unpack[CompressWords],
+    **words: "Unpack[CompressWords]",
 ) -> tuple[bytes, CompressResult]:
     """Compress a scene to the bytes of a `.fgs`: the same bytes that `compress` writes.
 

@@ -1,7 +1,5 @@
 """A scene from a file or from arrays, which can be read, written and drawn."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 
@@ -46,7 +44,7 @@ class Scene:
         lod: int | None = None,
         sh_degree: int | None = None,
         crop: str | None = None,
-    ) -> Scene:
+    ) -> "Scene":
         """Open a scene file (`.ply`, `.fgs`, `.spz`, `.sog`, `.compressed.ply`) or a model folder.
 
         Parameters
@@ -88,7 +86,7 @@ class Scene:
         sh_rest: Numbers | None = None,
         antialiased: bool = False,
         drop_invalid: bool = False,
-    ) -> Scene:
+    ) -> "Scene":
         """Make a scene from the values that training stores, before exp, sigmoid and normalisation. Copies the values.
 
         Parameters

@@ -1,7 +1,5 @@
 """The points that a search measured, its answer, and the order of two points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -28,7 +26,7 @@ class Choice:
             )
 
     @classmethod
-    def from_rates(cls, prune: float, sh: float) -> Choice:
+    def from_rates(cls, prune: float, sh: float) -> "Choice":
         """A choice from shares between 0 and 1, rounded to thousandths.
 
         >>> Choice.from_rates(0.4, 0.3)

@@ -4,8 +4,6 @@ A target gives each measured point its `excess`: by how much the point misses. Z
 smoothly with compression, so that the search may interpolate in it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -36,7 +34,7 @@ class Measurement:
     drop: float | None
     fidelity: float | None  # PSNR against the original's renders; `None` if they are identical
     modelled_drop: float  # drop modelled from the error against the original's renders
-    worst: Measurement | None = None  # quality of the worst view alone
+    worst: "Measurement | None" = None  # quality of the worst view alone
     # The same figures over covered pixels, which decide in place of the plain ones; `None` if the plain ones decide.
     covered: Covered | None = None
     # Mean over the views of the drop that decides, where a view that gains counts as 0; `None` if not known.

@@ -1,7 +1,5 @@
 """A scene in integer codes, which a container codes, and the values that every decoder makes of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,7 +37,7 @@ class GridScene:
         """Number of rows with SH above degree 0."""
         return int(np.count_nonzero(self.sh_degrees))
 
-    def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> GridScene:
+    def take(self, rows: np.ndarray, storage: Storage = IN_MEMORY) -> "GridScene":
         """A new scene of the given rows, in their order, with the highest SH degree that is left."""
         rows = np.arange(self.count)[rows]
         degrees = self.sh_degrees[rows]

@@ -1,7 +1,5 @@
 """Step sizes of a grid: one for each kind of value, and one for each SH degree."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -56,7 +54,7 @@ class StepSizes:
         return {name: value for name, value in asdict(self).items() if name != "contraction"}
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> StepSizes:
+    def from_json(cls, record: Mapping[str, Any]) -> "StepSizes":
         """Inverse of `to_json`."""
         contraction = Contraction.from_json(record["contraction"]) if "contraction" in record else None
         return cls(**{**record, "sh": tuple(record["sh"]), "contraction": contraction})

@@ -19,8 +19,6 @@ they are. POSITION states its least and largest values, so that a file can tell:
 circle about y), the values are taken as they are.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -214,7 +212,7 @@ class _Reader:
         self.attributes.append(splats)
         return splats
 
-    def _colours(self, attributes: _Attributes, missing: str, widths: tuple[int, ...]) -> Packed:
+    def _colours(self, attributes: "_Attributes", missing: str, widths: tuple[int, ...]) -> Packed:
         """COLOR_0, in place of an attribute that is missing."""
         colours = attributes.find("COLOR_0", widths)
         if colours is None:

@@ -1,7 +1,5 @@
 """What a user may say about how a scene file is read, and which part of it (`--crop`)."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, replace
@@ -36,7 +34,7 @@ class Reading:
     @classmethod
     def of(
         cls, frame: str | None, lod: int | None = None, sh_degree: int | None = None, crop: str | None = None
-    ) -> Reading:
+    ) -> "Reading":
         """From the words of options."""
         box = None if crop is None else parse_crop(crop)
         return cls(None if frame is None else Frame(frame.strip().upper()), lod, sh_degree, box)
@@ -46,7 +44,7 @@ class Reading:
         if self.budget is not None:
             self.budget.require(f"reading {name}", self.held + size)
 
-    def beside(self, held: int) -> Reading:
+    def beside(self, held: int) -> "Reading":
         """For one more file where others hold so many bytes."""
         return replace(self, held=held)
 

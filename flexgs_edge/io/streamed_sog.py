@@ -3,8 +3,6 @@
 The leaves of its tree name ranges of rows in SOG scenes, for each level that they have. Level 0 is the finest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -37,7 +35,7 @@ class _Range:
         return self.offset + self.count
 
 
-def read_streamed_sog(path: Path, name: str, reading: Reading) -> StreamedSource:
+def read_streamed_sog(path: Path, name: str, reading: Reading) -> "StreamedSource":
     """Open the level that is asked for, by default the finest whose files are there; see `read_foreign`.
 
     Raises `InputError` if the level is not there. Raises `FormatError` if a file is damaged, or ranges do not fit the

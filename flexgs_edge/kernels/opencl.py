@@ -1,7 +1,5 @@
 """The OpenCL backend: build the kernels for one device, and launch them by name."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings
@@ -67,7 +65,7 @@ def built_program(context: cl.Context, source: str, options: tuple[str, ...]) ->
 class DeviceArray:
     """A buffer on the device, with the shape and dtype of its array."""
 
-    def __init__(self, backend: OpenCLBackend, shape: tuple[int, ...], dtype: Any) -> None:
+    def __init__(self, backend: "OpenCLBackend", shape: tuple[int, ...], dtype: Any) -> None:
         self.shape = shape
         self.dtype = np.dtype(dtype)
         self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize

@@ -4,8 +4,6 @@ A record is made by `benchmarks.self_test` on the NumPy twins and lies beside th
 a new one; a test says so.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import zlib
@@ -55,7 +53,7 @@ class Record:
         return zlib.compress(len(head).to_bytes(4, "little") + head + body, 9)
 
     @classmethod
-    def unpack(cls, data: bytes) -> Record:
+    def unpack(cls, data: bytes) -> "Record":
         """From the bytes of `pack`."""
         data = zlib.decompress(data)
         at = 4 + int.from_bytes(data[:4], "little")

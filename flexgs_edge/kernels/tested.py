@@ -3,8 +3,6 @@
 A run opens one by `counted_backend`, which counts its memory.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -30,7 +28,7 @@ MOST_SECONDS = 1800  # Time for the test of one device, with all kernels to buil
 MARK = "self-test: "  # Begins the lines of `CHILD` that are for us; runtimes print other ones
 FORM = "form "  # Begins what such a line says when another form of the kernels begins; other lines name kernels
 
-_known: dict[str, Verdict] = {}
+_known: "dict[str, Verdict]" = {}
 _warned: set[str] = set()
 CACHE_VARIABLE = "FLEXGS_CACHE_DIR"  # Environment variable with another folder for what we keep between runs
 _ABOUT = ("name", "platform", "driver", "opencl_c", "type", "native_width", "max_work_group", "local_bytes")

@@ -5,8 +5,6 @@ a stage declares. A stage asks for `fixed` bytes plus `per_row` bytes. The plann
 error that names a sufficient limit: the smallest one for this stage, or one for the whole run where it is foreseen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -38,7 +36,7 @@ class MemoryBudget:
     """Keeps freed memory from counting against the limit; None where pages of scratch files may lie above the limit."""
 
     @classmethod
-    def from_limit(cls, limit: int | None) -> MemoryBudget:
+    def from_limit(cls, limit: int | None) -> "MemoryBudget":
         """A budget of `limit` bytes; by default, the memory held now plus 3/4 of the memory that is available."""
         used = current_rss()
         return cls(limit if limit is not None else used + available_memory() * 3 // 4, used)

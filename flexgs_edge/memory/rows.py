@@ -1,7 +1,5 @@
 """Copy rows of arrays that may lie in mapped scratch files, with plain reads and writes instead of page faults."""
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 import os
@@ -37,7 +35,7 @@ class DirectFile:
         self._descriptor = descriptor
 
     @classmethod
-    def of(cls, file: BinaryIO) -> DirectFile | None:
+    def of(cls, file: BinaryIO) -> "DirectFile | None":
         """Open `file` again; None if the system or the disk does not support it."""
         with suppress(OSError, AttributeError):
             return cls(os.open(f"/proc/self/fd/{file.fileno()}", os.O_RDONLY | os.O_DIRECT))

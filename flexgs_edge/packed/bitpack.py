@@ -4,8 +4,6 @@ Eight codes of b bits fill exactly b bytes, so every eighth row starts at a whol
 and keep the first b bytes. Any range of rows can be read without the rest. `BitSpec` says how many bits each attribute has.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
@@ -131,7 +129,7 @@ class BitSpec:
                 raise InputError(f"bits of {name}: expected 1 to {MAX_BITS}, got {bits!r}")
 
     @classmethod
-    def parse(cls, text: str) -> BitSpec:
+    def parse(cls, text: str) -> "BitSpec":
         """Read `xyz=16,dc=8,...`; attributes that are not named keep the default bits.
 
         >>> str(BitSpec.parse("rest=3,xyz=14"))
@@ -149,7 +147,7 @@ class BitSpec:
         return cls(**given)
 
     @classmethod
-    def rtn(cls, bits: int) -> BitSpec:
+    def rtn(cls, bits: int) -> "BitSpec":
         """The same bits for all attributes; with `groups=1`, plain round to nearest, a baseline of the studies."""
         return cls(*[bits] * len(fields(cls)))
 

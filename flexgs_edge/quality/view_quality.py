@@ -5,8 +5,6 @@ covers: each pixel counts by the original's alpha there. Empty background then c
 the original's silhouette still count. Both are equal where the original fills the picture.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -108,7 +106,7 @@ class _MeanOf:
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, quality: Quality, owner: type) -> float | None:
+    def __get__(self, quality: "Quality", owner: type) -> float | None:
         return mean_psnr([getattr(view, self._name) for view in quality.views])
 
 
@@ -119,7 +117,7 @@ class Quality:
     views: tuple[ViewQuality, ...]  # one record for each view, sorted by name
     base_psnr: float = DEFAULT_BASE_PSNR  # assumed PSNR of the original against photos, for the modelled drop, dB
     covered_decides: bool = False  # The covered figures decide: there are no photos. Default: the plain figures decide.
-    made: Quality | None = None  # quality at made poses, where no given camera stood; `None` if not measured
+    made: "Quality | None" = None  # quality at made poses, where no given camera stood; `None` if not measured
 
     fidelity = _MeanOf()  # against the original's renders, dB; `None` if every view is identical
     psnr, original_psnr, drop = _MeanOf(), _MeanOf(), _MeanOf()  # against the photos, dB; `None` without photos

@@ -1,7 +1,5 @@
 """Sums over views for each Gaussian: how many pixels it touches, and how much it contributes to them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +24,7 @@ class Statistics:
     weights: np.ndarray
 
     @classmethod
-    def zeros(cls, count: int) -> Statistics:
+    def zeros(cls, count: int) -> "Statistics":
         """Statistics before the first view: all zero."""
         return cls(np.zeros(count, np.int64), np.zeros(count, np.uint64))
 

@@ -1,7 +1,5 @@
 """Results of the commands that compare no pictures: from `decompress` to `devices`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -212,7 +210,7 @@ class ViewResult(Result):
 class DevicesResult(Result):
     """Result of `devices`: the OpenCL devices, and the chosen one."""
 
-    devices: tuple[DeviceInfo, ...]  # limits and self-test verdict of each device
+    devices: "tuple[DeviceInfo, ...]"  # limits and self-test verdict of each device
     chosen: int | None  # index of the chosen device; `None` if no device works, or not the one asked for
     reason: str  # why this device was chosen, or why none was
 

@@ -1,7 +1,5 @@
 """Fill the templates of `templates/`. Each page is one file and fetches nothing. Only this module imports jinja2."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -32,7 +30,7 @@ def render(template: str, **values: object) -> str:
 
 
 @cache
-def environment() -> Environment:
+def environment() -> "Environment":
     """Create the jinja2 environment: the templates and their filters."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup

@@ -1,7 +1,5 @@
 """Lines of the printed summary that several results share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -41,7 +39,7 @@ def view_lines(views: ViewsInfo | None) -> list[str]:
     return lines + [line("note", note) for note in views.notes]
 
 
-def quality_lines(quality: Quality, where: str) -> list[str]:
+def quality_lines(quality: "Quality", where: str) -> list[str]:
     """Describe drop, fidelity and the worst view; `where` names the views that were measured."""
     lines = []
     if quality.drop is not None:
@@ -80,7 +78,7 @@ def quality_lines(quality: Quality, where: str) -> list[str]:
     return lines
 
 
-def _photo_lines(quality: Quality) -> list[str]:
+def _photo_lines(quality: "Quality") -> list[str]:
     """What was done to photos of another exposure, and which views do not count by their photo."""
     lines, total = [], len(quality.views)
     stops = [stop for view in quality.views for stop in view.exposure or ()]

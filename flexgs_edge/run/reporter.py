@@ -1,7 +1,5 @@
 """`--report DIR`: collect pictures and figures during a run, and write the page and the record at the end."""
 
-from __future__ import annotations
-
 import io
 import os
 import tempfile
@@ -135,7 +133,7 @@ class Reporter:
         self._check()
 
     @classmethod
-    def maybe(cls, folder: str | Path | None, force: bool) -> Reporter | None:
+    def maybe(cls, folder: str | Path | None, force: bool) -> "Reporter | None":
         """Create a reporter, or return `None` if no report is asked for."""
         return None if folder is None else cls(folder, force)
 

@@ -1,7 +1,5 @@
 """What was asked, of what, and the plan: the record that a command opens once and every step reads."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -65,7 +63,7 @@ class Plan:
     needs_scores: bool  # whether the method computes importance scores
 
     @classmethod
-    def make(cls, options: CompressOptions, scene: inputs.CheckedScene, views: view_set.ViewSet | None) -> Plan:
+    def make(cls, options: CompressOptions, scene: inputs.CheckedScene, views: view_set.ViewSet | None) -> "Plan":
         fixed = options.fixed
         needs_scores = fixed != EVERYTHING and options.method == "paper"
         if views is None:
@@ -159,7 +157,7 @@ class Run(Generic[inputs.Options]):
         assert self.plan is not None and self.plan.target is not None
         return self.plan.target
 
-    def of_source(self, source: SceneSource) -> Run[inputs.Options]:
+    def of_source(self, source: SceneSource) -> "Run[inputs.Options]":
         """The same run on other values."""
         return replace(self, scene=replace(self.scene, source=source))
 

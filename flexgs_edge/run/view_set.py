@@ -1,7 +1,5 @@
 """The views of a run: cameras, photos, the split into training and held-out views, and the background behind them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -91,7 +89,7 @@ class GivenViews:
     # File that the cameras were read from, so that photos beside it are found. Default: unknown.
     cameras_from: str = MEMORY
 
-    def in_order_of_name(self) -> GivenViews:
+    def in_order_of_name(self) -> "GivenViews":
         """Return a copy with cameras, and their photos, in order of name; equal names are made distinct."""
         cameras, images = self.cameras or (), self.images
         if not cameras:

@@ -6,8 +6,6 @@ error of one grid step then grows with the distance, as views allow. Mip-NeRF 36
 2 - 1 / m; a logarithm in straight pieces is undone by operations that every machine rounds alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -64,7 +62,7 @@ class Contraction:
         return {"centre": list(self.centre), "radius": self.radius}
 
     @classmethod
-    def from_json(cls, record: Mapping[str, Any]) -> Contraction:
+    def from_json(cls, record: Mapping[str, Any]) -> "Contraction":
         """Inverse of `to_json`."""
         x, y, z = record["centre"]
         return cls((x, y, z), record["radius"])

@@ -1,7 +1,5 @@
 """A part of a scene: the Gaussians of which at least half lies inside of a box or a sphere."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product as combinations
 from typing import Any
@@ -39,7 +37,7 @@ class Crop:
             return f"the sphere of radius {self.half[0]:.6g} around {centre}"
         return f"the box of {' x '.join(f'{2 * edge:.6g}' for edge in self.half)} around {centre}"
 
-    def turned(self, signs: tuple[int, ...]) -> Crop:
+    def turned(self, signs: tuple[int, ...]) -> "Crop":
         """In a frame whose axes have these directions (1 or -1 each)."""
         centre = tuple(value * sign for value, sign in zip(self.centre, signs, strict=True))
         axes = tuple(tuple(value * sign for value, sign in zip(axis, signs, strict=True)) for axis in self.axes)

@@ -3,8 +3,6 @@
 Sources that change what another one gives stand here too.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -85,7 +83,7 @@ class SceneSource(ABC):
         """Number of channels of `field` in this scene."""
         return FIELD[field].width(self.sh_degree)
 
-    def select(self, rows: np.ndarray) -> SceneSource:
+    def select(self, rows: np.ndarray) -> "SceneSource":
         """A source of the given rows ([n] int64, in any order, which is kept); nothing is read yet."""
         return SelectSource(self, rows)
 

@@ -1,7 +1,5 @@
 """The results of a study on a scene: tables, text, a record for programs, and files."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os
@@ -140,7 +138,7 @@ class SceneStudy:
     run: RunInfo
 
     @classmethod
-    def of(cls, path: str | Path, found: CompressResult, *experiments: Experiment) -> SceneStudy:
+    def of(cls, path: str | Path, found: CompressResult, *experiments: Experiment) -> "SceneStudy":
         """Experiments on the scene of a run of `compress`."""
         assert found.views is not None
         return cls(scene_name(path), found.scene, found.views, decided_words(found), experiments, found.run)

@@ -1,7 +1,5 @@
 """Renders of the original model, the targets of fine-tuning in place of photos: a scratch file holds them in half precision."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -45,7 +43,7 @@ class References(AbstractContextManager["References"]):
         cameras: Sequence[Camera],
         scratch: str | Path | None = None,
         progress: Progress = SILENT,
-    ) -> References:
+    ) -> "References":
         """Render `scene` from each camera and keep the views."""
         views = cls(scratch)
         try:

@@ -1,7 +1,5 @@
 """Write, open and verify `.fgs` files of version 1, and their header (docs/format.md)."""
 
-from __future__ import annotations
-
 import os
 import zlib
 from collections.abc import Iterator, Mapping
@@ -46,7 +44,7 @@ class Header:
     contraction: Contraction | None = None  # as in `QuantizedScene`
 
     @classmethod
-    def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> Header:
+    def of_scene(cls, scene: QuantizedScene, settings: Mapping[str, Any]) -> "Header":
         """Make the header of a quantized scene; raises `InputError` for settings that JSON cannot hold."""
         groups = {FIELD[name].bits: array.groups for name, array in scene.arrays.items()}
         x, y, z = (float(value) for value in scene.origin)

@@ -1,7 +1,5 @@
 """Fit a model to a grid scene and encode its chunks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -198,7 +196,7 @@ class Encoded:
             lambda pair: encode_chunk(self.model, *pair), pairs, self.threads or thread_count(len(pairs))
         )
 
-    def finished(self) -> Encoded:
+    def finished(self) -> "Encoded":
         """A copy that holds the coded streams in place of the symbols, which are several times larger."""
         return replace(self, written=tuple(self.streams()), batches=[])
 

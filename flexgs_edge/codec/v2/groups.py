@@ -4,8 +4,6 @@ A channel is predicted from weighted sums of features. All features, weights and
 if a bound shows that it holds the sum exactly, else in float64. Both give the same numbers; float32 takes half the time.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +30,7 @@ class Features:
         self.values = np.zeros((width, count), np.float32)
         self.largest = np.zeros(width)
 
-    def seal(self, first: int = 0, stop: int | None = None) -> Features:
+    def seal(self, first: int = 0, stop: int | None = None) -> "Features":
         """Update `largest` after features [first, stop) were written."""
         part = self.values[first:stop]
         if part.shape[1]:
@@ -185,7 +183,7 @@ class Group:
         return head + weights + b"".join(cut.astype("<i4").tobytes() for cut in self.cuts)
 
     @classmethod
-    def read(cls, kind: GroupKind, data: bytes, at: int) -> tuple[Group, int]:
+    def read(cls, kind: GroupKind, data: bytes, at: int) -> "tuple[Group, int]":
         """Read a group's record at byte `at`; returns the group and the byte after the record."""
         if len(data) < at + _HEAD.size:
             raise StreamError(f"group {kind.name}: wanted {_HEAD.size} bytes, got {len(data) - at}")

@@ -1,7 +1,5 @@
 """The fitted model of a file, and three ports for the walk over a chunk: to collect samples for the fit, to count, to decode."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,7 +56,7 @@ class Model:
         return records + encode_tables([self.mappings[i] for i in alphabets], [self.levels[i] for i in alphabets])
 
     @classmethod
-    def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> Model:
+    def from_bytes(cls, data: bytes, sh_degree: int, depth: int) -> "Model":
         """Inverse of `to_bytes`; raises `StreamError` for a damaged model."""
         groups, at = [], 0
         for kind in group_kinds(sh_degree):
@@ -156,7 +154,7 @@ class CountPort:
         self.raw = np.zeros(len(shapes))
         self.batches: list[Batch] = []
 
-    def add(self, other: CountPort) -> None:
+    def add(self, other: "CountPort") -> None:
         """Add the counts of another port; they are integers, so the order does not matter."""
         for counts, more in zip(self.counts, other.counts, strict=True):
             counts += more

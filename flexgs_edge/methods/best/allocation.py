@@ -4,8 +4,6 @@ A Gaussian is removed, or kept with SH up to some degree, whichever has the leas
 last round of pruning that the multiplier cuts by at most a round.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -160,7 +158,7 @@ class Kept:
     weight2: np.ndarray  # [n] f64, sums of squared weights
     left_out: int = 0  # how many rows were left out because the grid would be coarser with them (`reachable`)
 
-    def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> Kept:
+    def take(self, keep: np.ndarray, storage: Storage = IN_MEMORY) -> "Kept":
         """The rows for which `keep` ([n] bool) is True."""
         if keep.all():
             return self

@@ -4,8 +4,6 @@ Before the search starts we estimate how many bytes it holds. If they do not fit
 scratch files. The output has the same bytes either way, but the search takes longer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +58,7 @@ class MemoryPlan:
     least: int  # least bytes that drawing needs beside them
 
     @classmethod
-    def of(cls, run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera]) -> MemoryPlan:
+    def of(cls, run: Run[CompressOptions], renderer: Renderer, scored: Sequence[Camera]) -> "MemoryPlan":
         """The plan of a search with these scored poses, where the renderer's storage is."""
         source, options, largest = run.source, run.options, largest_of(scored)
         steps = finetune_steps(options, len(scored), source.count, is_fine(options, source))

@@ -16,8 +16,6 @@ Steps are counted and never timed, and the model adds plain Python floats in a f
 same bytes.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -53,7 +51,7 @@ class LossModel:
     sh: float
 
     @classmethod
-    def fit(cls, points: list[tuple[Choice, float]]) -> LossModel:
+    def fit(cls, points: list[tuple[Choice, float]]) -> "LossModel":
         """Fit `points` by weighted least squares; the prior slopes decide where points leave a direction open.
 
         Slopes stay at or above zero, because more compression never gains quality.

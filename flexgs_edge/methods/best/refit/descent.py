@@ -1,7 +1,5 @@
 """Gradient descent on a device: all values of a scene move by Adam, one view a step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import AbstractContextManager

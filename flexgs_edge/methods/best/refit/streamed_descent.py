@@ -3,8 +3,6 @@
 The values are those of `Descent`, bit for bit: a step changes no row that its view does not show.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -126,7 +124,7 @@ def open_descent(
     origin: np.ndarray,
     camera: Camera,
     structure: float = 0.0,
-) -> descent.Descent | StreamedDescent:
+) -> "descent.Descent | StreamedDescent":
     """A descent in memory, or in scratch files if the renderer's storage has them and memory has no room.
 
     Parameters are those of `Descent`.
