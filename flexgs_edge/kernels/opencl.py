@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ SCAN_GROUPS = (1024, 256, 64)  # Sizes of the work-group that scans on GPUs: the
 LIST_GROUP = 64  # Size of the work-groups that list pairs on GPUs
 GPU_BLOCKS = (64, 256)
 """Least and most work-items of the serial passes on GPUs; between them, two for each compute unit."""
+_CONTEXTS: dict[int, cl.Context] = {}  # By device
 _PROGRAMS: dict[tuple[int, str, tuple[str, ...]], tuple[cl.Context, cl.Program]] = {}
 """By context, source and options. Each keeps its context, so that no other one takes its number."""
 SCALARS = {"u": np.uint32, "i": np.int32, "f": np.float32, "b": None}
@@ -41,10 +41,11 @@ HELD_WRITE = 1 << 22
 docs/results/tuning.md#one_pass"""
 
 
-@cache
 def context_of(device: cl.Device) -> cl.Context:
     """The context of `device`; raises `cl.Error`."""
-    return cl.Context([device])
+    if device.int_ptr not in _CONTEXTS:
+        _CONTEXTS[device.int_ptr] = cl.Context([device])
+    return _CONTEXTS[device.int_ptr]
 
 
 def built_program(context: cl.Context, source: str, options: tuple[str, ...]) -> tuple[cl.Program, float]:

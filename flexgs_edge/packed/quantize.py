@@ -8,11 +8,8 @@ All numbers are stored and computed in float32. x' takes one multiplication and 
 that every device gives the same bits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,11 +19,7 @@ from flexgs_edge.packed.bitpack import PAPER, BitSpec, pack_into, plane_bytes, u
 from flexgs_edge.scene.contraction import LARGEST, Contraction, densest
 from flexgs_edge.scene.fields import FIELD, FIELDS
 from flexgs_edge.scene.rotations import normalize_quats
-from flexgs_edge.scene.source import SAMPLE_ROWS, some_positions
-
-if TYPE_CHECKING:
-    from flexgs_edge.scene.source import SceneSource
-
+from flexgs_edge.scene.source import SAMPLE_ROWS, SceneSource, some_positions
 
 FINER = 128  # Within the radius of a contraction, steps of 16 bits are this many times shorter than Gaussians are wide
 SMALLEST_STEP = 2.0**-126

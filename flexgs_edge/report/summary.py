@@ -9,7 +9,6 @@ from flexgs_edge.units import format_mib, format_size, smaller_words
 if TYPE_CHECKING:  # so that `trim` and `verify` start without kernels
     from flexgs_edge.quality.view_quality import Quality
 
-
 FAR_SHOWN = 4  # Names of views that one line shows
 
 

@@ -18,7 +18,6 @@ from flexgs_edge.scene.contraction import Contraction
 from flexgs_edge.scene.fields import FIELD, FIELDS
 
 VERSION = 1
-
 Ranges = dict[str, tuple[np.ndarray, np.ndarray]]  # (low, step) of each field, [channels, G] f32 both
 CHUNK_ROWS = 65536  # Rows of a chunk: a multiple of 8, so that each plane ends at a whole byte for any number of bits
 HEADER_STEP = 1024  # Headers are padded to a multiple of this many bytes

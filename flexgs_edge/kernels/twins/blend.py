@@ -8,14 +8,24 @@ from functools import partial
 
 import numpy as np
 
-from flexgs_edge import constants
+from flexgs_edge.constants import (
+    ALPHA_MAX,
+    BLOCK,
+    FIXED_ERROR,
+    FIXED_LARGEST,
+    FIXED_MOMENT,
+    FIXED_WEIGHT,
+    LOG2_ALPHA_MIN,
+    TILE,
+    TRANSMITTANCE_MIN,
+)
 from flexgs_edge.kernels.twins.arithmetic import Array, Size, f32, fexp2_within, fma, splat_exponent
 
 TILES_AT_ONCE = 256
 """Tiles of a group. It bounds the twin's memory: block lists and, for statistics, one float a pixel of each listed block."""
 
-_LANE = np.arange(constants.BLOCK * constants.BLOCK)
-_LANE_X, _LANE_Y = (_LANE % constants.BLOCK).astype(f32), (_LANE // constants.BLOCK).astype(f32)
+_LANE = np.arange(BLOCK * BLOCK)
+_LANE_X, _LANE_Y = (_LANE % BLOCK).astype(f32), (_LANE // BLOCK).astype(f32)
 
 
 @dataclass
@@ -51,7 +61,7 @@ class _Entries:
 
 def _fixed(lanes: Array, unit: float, tiles: int) -> Array:
     """[pairs] i64, sums of [pairs, 16] lanes: the pairwise tree, then fixed point, clamped to a tile's part of 64 bits."""
-    largest = f32(constants.FIXED_LARGEST / 2.0 ** tiles.bit_length())
+    largest = f32(FIXED_LARGEST / 2.0 ** tiles.bit_length())
     eight = lanes[:, :8] + lanes[:, 8:]
     four = eight[:, :4] + eight[:, 4:]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
@@ -65,9 +75,7 @@ PLANES = {
     4: ("weight", "red", "green", "blue", "error", "square"),
     5: ("red", "green", "blue", "slope", "x", "y", "xx", "xy", "yy"),
 }  # Planes of the fixed-point sums, for each kind of statistics
-UNITS = {"error": constants.FIXED_ERROR, "square": constants.FIXED_ERROR} | dict.fromkeys(
-    PLANES[5][4:], constants.FIXED_MOMENT
-)
+UNITS = {"error": FIXED_ERROR, "square": FIXED_ERROR} | dict.fromkeys(PLANES[5][4:], FIXED_MOMENT)
 """Units of the planes whose unit is not 1 / FIXED_WEIGHT."""
 
 
@@ -111,7 +119,7 @@ def _add_sums(
     if stats == 1:
         np.add.at(hits, rows_of, count)
     for c, name in enumerate(planes):
-        unit = UNITS.get(name, constants.FIXED_WEIGHT)
+        unit = UNITS.get(name, FIXED_WEIGHT)
         np.add.at(sums.view(np.int64)[:, c, 0], rows_of[some], _fixed(lanes[name][some], unit, tiles))
 
 
@@ -132,8 +140,8 @@ def blend(
         part = pairs[tile_ends[first] : tile_ends[last]]
         lists = _block_lists(np.repeat(np.arange(last - first), counts), part[:, 1], last - first)
         unit = np.arange((last - first) * 16)
-        x0 = ((first + unit // 16) % tiles_x) * constants.TILE + constants.BLOCK * (unit % 4)
-        y0 = ((first + unit // 16) // tiles_x) * constants.TILE + constants.BLOCK * (unit % 16 // 4)
+        x0 = ((first + unit // 16) % tiles_x) * TILE + BLOCK * (unit % 4)
+        y0 = ((first + unit // 16) // tiles_x) * TILE + BLOCK * (unit % 16 // 4)
         px, py = x0.astype(f32)[:, None] + _LANE_X, y0.astype(f32)[:, None] + _LANE_Y
         if resume:
             own = state[first:last].reshape(-1, 4, 16, 16).transpose(1, 0, 2, 3).reshape(4, -1, 16)
@@ -183,12 +191,12 @@ def _blend_blocks(
         r = records[rows_of[lists.pair[entry]]]
         dx, dy = pixels[0][units] - r[:, 0:1], pixels[1][units] - r[:, 1:2]
         exponent = splat_exponent(dx, dy, r[:, 2:3], r[:, 3:4], r[:, 4:5], r[:, 5:6])
-        seen = exponent >= f32(constants.LOG2_ALPHA_MIN)
+        seen = exponent >= f32(LOG2_ALPHA_MIN)
         # The kernel's value is undefined where a splat is not seen, and is not used there.
         alpha = np.where(seen, fexp2_within(np.where(seen, exponent, f32(0))), f32(0))
         t = trans[units]
         after = fma(-alpha, t, t)
-        hit = seen & (after >= f32(constants.TRANSMITTANCE_MIN))
+        hit = seen & (after >= f32(TRANSMITTANCE_MIN))
         weight = np.where(hit, alpha * t, f32(0))
         own = [r[:, 6 + c : 7 + c] for c in range(3)]
         trans[units] = np.where(hit, after, np.where(seen, -np.abs(t), t))
@@ -207,7 +215,7 @@ def _blend_blocks(
             assert rest is not None
             light = fma(own[2], rest[2, units], fma(own[1], rest[1, units], own[0] * rest[0, units]))
             slope = ratio * fma(light, t, -colour[0, units])
-            entries.error[entry] = np.where(alpha < f32(constants.ALPHA_MAX), slope, f32(0))
+            entries.error[entry] = np.where(alpha < f32(ALPHA_MAX), slope, f32(0))
             entries.place[0, entry], entries.place[1, entry] = dx, dy
             colour[0, units] = fma(-weight, light, colour[0, units])
     return entries if stats else None

@@ -20,6 +20,7 @@ from flexgs_edge.methods.best.rounds import MOST_PARTS, PARTS, parts_of, sum_row
 from flexgs_edge.progress import LOG
 from flexgs_edge.render import fit as needs
 from flexgs_edge.render.ahead import AHEAD_ROW_BYTES
+from flexgs_edge.render.fit import DEFAULT
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.render.view_buffers import view_size
 from flexgs_edge.run.open_renderer import drawing_bytes, shown_rows, size_of
@@ -39,12 +40,12 @@ def expected_bytes(run: Run[CompressOptions]) -> int:
     cameras = run.seen.of(run.seen.train)
     size = size_of(largest_of(cameras))  # poses of large weight keep all their pixels
     distils = finetune_steps(options, len(cameras), source.count) > 0
-    held = sum(needed_bytes(needs.DEFAULT, size, source, len(cameras), options, distils))
+    held = sum(needed_bytes(DEFAULT, size, source, len(cameras), options, distils))
     if run.output.format is not None:
         return held
-    pruning = spilled_bytes(needs.DEFAULT, source, size, shown_rows(run), False)
-    few = -(-source.count // needs.DEFAULT.first_share)  # descents begin once many rows went
-    descent = spilled_bytes(needs.DEFAULT, source, size, few, distils)
+    pruning = spilled_bytes(DEFAULT, source, size, shown_rows(run), False)
+    few = -(-source.count // DEFAULT.first_share)  # descents begin once many rows went
+    descent = spilled_bytes(DEFAULT, source, size, few, distils)
     view = max(pruning, descent, drawing_bytes(run))
     return min(held, READING_BYTES + SPILLED_ROW_BYTES * source.count + view)
 

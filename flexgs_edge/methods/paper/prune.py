@@ -4,16 +4,12 @@ Source: FlexGaussian (ACM MM 2025), section on ADP. Rates are integers in thousa
 same rows on every machine.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from flexgs_edge.errors import InputError
 from flexgs_edge.goals.steps import Choice
 from flexgs_edge.memory.rows import blocks
-
-if TYPE_CHECKING:
-    from flexgs_edge.scene.source import SceneSource
+from flexgs_edge.scene.source import SceneSource
 
 
 def order_from_scores(scores: np.ndarray) -> np.ndarray:
@@ -57,7 +53,7 @@ def select_rows(ranks: np.ndarray, choice: Choice, has_sh: np.ndarray | None = N
     return np.flatnonzero(with_sh), np.flatnonzero(kept & ~with_sh)
 
 
-def nonzero_sh(source: "SceneSource", chunk_rows: int = 65536) -> np.ndarray:
+def nonzero_sh(source: SceneSource, chunk_rows: int = 65536) -> np.ndarray:
     """[N] bool: rows with any SH coefficient above degree 0 that is not zero; read by chunks."""
     found = np.zeros(source.count, bool)
     if source.sh_degree == 0:

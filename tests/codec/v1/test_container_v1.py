@@ -229,4 +229,4 @@ def test_golden_bytes(tmp_path: Path) -> None:
 
 def test_constants_of_the_format() -> None:
     assert layout.CHUNK_ROWS == 65536
-    assert layout.PREAMBLE_BYTES == 36
+    assert layout.sections.PREAMBLE_BYTES == 36
