@@ -7,6 +7,7 @@ search asks for exact sizes (`GridCoder`) and measured quality (`QualityEvaluato
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_byte
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, LEVEL_SHARE, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, Maker, Product, joined, search
+from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, Maker, Product, search, search_on
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
@@ -256,9 +257,8 @@ def search_best(
             rounds = rounds_of(original, checkpoint)
             takes_closest = options.takes_closest or (plain is not None and plain.reached)
             maker = make(rounds, measure, see if options.makes_poses else None)
-            found = search(maker, target, tried=tried, best_effort=takes_closest, on_step=tell)
-            if plain is not None:
-                found = joined(plain, found, target)
+            later = partial(search, maker, target, tried=tried, best_effort=takes_closest, on_step=tell)
+            found = later() if plain is None else search_on(plain, later, target)
     finally:
         run.budget.give(plan.held)
     if found.chosen.left_out:

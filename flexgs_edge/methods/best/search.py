@@ -131,12 +131,21 @@ class RateResult(Generic[Product]):
     chosen: Candidate  # the best candidate, which `product` belongs to
     reached: bool  # whether it meets the target
     steps: tuple[Candidate, ...]  # all candidates in the order of the search
+    interrupted: bool = False  # whether Ctrl-C ended the search
 
 
-def joined(first: RateResult[Product], later: RateResult[Product], target: Target) -> RateResult[Product]:
-    """The better one of the answers of two searches, with the candidates of both."""
-    best = later if better(later.chosen, first.chosen, target) else first
-    return RateResult(best.product, best.chosen, best.reached, first.steps + later.steps)
+def search_on(
+    first: RateResult[Product], later: Callable[[], RateResult[Product]], target: Target
+) -> RateResult[Product]:
+    """The better one of an answer and that of a search after it, with the candidates of both. Ctrl-C ends both searches."""
+    if first.interrupted:
+        return first
+    try:
+        found = later()
+    except KeyboardInterrupt:
+        return first
+    best = found if better(found.chosen, first.chosen, target) else first
+    return RateResult(best.product, best.chosen, best.reached, first.steps + found.steps, found.interrupted)
 
 
 def search(
@@ -153,7 +162,7 @@ def search(
     """
     steps: tuple[Candidate, ...] = ()
     best: tuple[Candidate, Product] | None = None
-    by_size = target.limit_bytes is not None
+    by_size, interrupted = target.limit_bytes is not None, False
 
     def tell(step: Candidate) -> None:
         nonlocal steps
@@ -186,6 +195,7 @@ def search(
         if best is None:
             raise
         LOG.warning("interrupted: the best result so far is taken")
+        interrupted = True
     assert best is not None
     chosen, product = best
     if not chosen.holds and not best_effort:
@@ -194,7 +204,7 @@ def search(
             f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
             f"{last} (--best-effort writes it){obstacle(target, chosen)}"
         )
-    return RateResult(product, chosen, chosen.holds, steps)
+    return RateResult(product, chosen, chosen.holds, steps, interrupted)
 
 
 def _aimed(maker: Maker[Product], place: float, target: Target) -> float:

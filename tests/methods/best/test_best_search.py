@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.promise import Promised, WorstView
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
-from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, next_place, search
+from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, next_place, search, search_on
 from known_maker import AT, BYTES, World, powers
 
 
@@ -125,10 +126,17 @@ def test_an_interrupted_search_takes_the_best_so_far() -> None:
             return super().make(multiplier, target)
 
     world = Interrupted(lambda m: 0.5, lambda m: BYTES)
-    assert search(world, MaxDrop(1.0)).chosen.size == BYTES
+    first = search(world, MaxDrop(1.0))
+    assert first.chosen.size == BYTES and first.interrupted
     world.made = [1.0]
     with pytest.raises(KeyboardInterrupt):
         search(world, MaxDrop(1.0))
+    # A search that is followed by another ends both, and keeps its answer where the other has none.
+    assert search_on(first, lambda: pytest.fail("no more"), MaxDrop(1.0)) is first
+    whole = replace(first, interrupted=False)
+    assert search_on(whole, lambda: search(world, MaxDrop(1.0)), MaxDrop(1.0)) is whole
+    both = search_on(whole, lambda: first, MaxDrop(1.0))
+    assert both.interrupted and both.steps == first.steps * 2 and both.chosen is first.chosen
 
 
 def test_a_miss_is_followed_by_a_smaller_multiplier_with_some_room() -> None:
