@@ -120,12 +120,12 @@ class BlendedView:
         assert buffers is not None
         self.records = backend.read(buffers.records)[:, :9]
         pairs, ends = backend.read(buffers.pairs), backend.read(buffers.ends)
-        self.ends = ends[(backend.tile_blocks - 1) * buffers.tiles :][: buffers.tiles].astype(np.int64)
+        self.ends = ends[(backend.tile_blocks - 1) * buffers.size.tiles :][: buffers.size.tiles].astype(np.int64)
         self.ids = pairs[: self.ends[-1], 0]
-        self.tiles_x, self.camera, self.least = buffers.tiles_x, camera, least
+        self.tiles_x, self.camera, self.least = buffers.size.tiles_x, camera, least
         self.background = np.array(renderer.background)
         # Pairs sorted by splat give the tiles of every splat.
-        tile_of = np.repeat(np.arange(buffers.tiles), np.diff(self.ends, prepend=0))
+        tile_of = np.repeat(np.arange(buffers.size.tiles), np.diff(self.ends, prepend=0))
         order = np.argsort(self.ids, kind="stable")
         self.by_splat, self.tiles_by_splat = self.ids[order], tile_of[order]
 

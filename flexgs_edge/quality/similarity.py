@@ -30,6 +30,7 @@ depend on bands. docs/results/tuning.md#flip"""
 _LIGHT, _RED_GREEN, _BLUES = 0.0047, 0.0053, ((34.1, FLIP_WIDEST), (13.5, 0.025))
 """Widths of the Gaussians that the paper fits to the eye's sensitivity to contrast. Yellow against blue has the sum of two, of
 which the first number is the height."""
+Pairs = Sequence[tuple[np.ndarray, np.ndarray]]
 LOST_SHARE = 0.7  # SSIM lost against photos, as a share of what is lost against the original's renders
 
 
@@ -77,7 +78,7 @@ def flip_bytes(width: int, height: int, images: int = 3) -> int:
     return 4 * (3 * read + FILTERS * (count + LANES) + (SEEN * images + 1) * count + FILTERS * (2 * FLIP_REACH + 1))
 
 
-def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+def flip_maps(backend: Backend, pairs: Pairs) -> list[np.ndarray]:
     """FLIP at every pixel of pairs of images of one size (LDR-FLIP, Andersson et al. 2020).
 
     FLIP says how different two images look to somebody who flips between them: 0 for equal ones, at most 1. It assumes
@@ -121,9 +122,27 @@ def flip_maps(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) 
             array.release()
 
 
-def flips(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+def flips(backend: Backend, pairs: Pairs) -> list[float | None]:
     """FLIP of pairs of images of one size, mean over the pixels; see `flip_maps`."""
-    return [float(found.mean(dtype=np.float64)) for found in flip_maps(backend, pairs)]
+    # Twice the reach: what filters see beyond a cut are repeated borders.
+    return [
+        float(found.sum(dtype=np.float64)) / max(pair[0][..., 0].size, 1)
+        for pair, found in zip(pairs, flip_maps(backend, _differing(pairs, 2 * FLIP_REACH)), strict=True)
+    ]
+
+
+def _differing(pairs: Pairs, reach: int) -> Pairs:
+    """The pairs cut down to a part: beyond it, and as far as `reach` pixels inside of it, each has two equal images.
+
+    An object before a background leaves most of a picture out.
+    """
+    if len({image.shape for pair in pairs for image in pair}) != 1 or not pairs[0][0].size:
+        return pairs
+    apart = np.logical_or.reduce([(one != two).any(axis=2) for one, two in pairs])
+    ends = (np.append(np.flatnonzero(apart.any(axis=axis)), [] if apart.any() else [0])[[0, -1]] for axis in (1, 0))
+    rows, columns = (slice(max(int(first) - reach, 0), int(last) + reach + 1) for first, last in ends)
+    parts = {id(image): image[rows, columns] for pair in pairs for image in pair}
+    return [(parts[id(one)], parts[id(two)]) for one, two in pairs]
 
 
 def _padded(image: np.ndarray, top: int, rows: int, stride: int) -> np.ndarray:
@@ -161,7 +180,7 @@ def ssim_bytes(width: int, height: int) -> int:
     return 4 * 8 * height * (-(-width // LANES) * LANES) + 4 * 5 * LANES
 
 
-def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[float | None]:
+def ssims(backend: Backend, pairs: Pairs) -> list[float | None]:
     """SSIM of pairs of images of one size, mean over pixels and channels (Wang et al. 2004).
 
     It takes a Gaussian window of sigma 1.5, population covariance, a data range of 1, and only windows inside the
@@ -171,6 +190,9 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
     """
     if not pairs or min(pairs[0][0].shape[:2]) < SSIM_WINDOW:
         return [None] * len(pairs)
+    height, width = pairs[0][0].shape[:2]
+    windows = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1)
+    pairs = _differing(pairs, SSIM_WINDOW - 1)
     height, width = pairs[0][0].shape[:2]
     rows, stride = height - SSIM_WINDOW + 1, -(-width // LANES) * LANES
     count = rows * stride
@@ -197,7 +219,8 @@ def ssims(backend: Backend, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> l
                 backend.launch("ssim_columns", (count,), count, stride, plane, taps, *images, moments)
                 backend.launch("ssim_rows", (count,), count, plane, taps, moments, similar)
                 inside = backend.read(similar).reshape(rows, stride)[:, : width - SSIM_WINDOW + 1]
-                totals[place] += float(inside.mean(dtype=np.float64))
+                # All other windows have two equal images, and an SSIM of 1.
+                totals[place] += (float(inside.sum(dtype=np.float64)) + windows - inside.size) / windows
         return [total / 3 for total in totals]
     finally:
         for array in arrays:

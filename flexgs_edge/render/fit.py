@@ -92,6 +92,11 @@ class ViewSize:
         """Pixels of all tiles; the last row and column of tiles may reach beyond the picture."""
         return self.tiles * TILE * TILE
 
+    @property
+    def slopes(self) -> int:
+        """Elements of the slopes of its SSIM: nine planes, which end in rows that the sums of the last pixels read."""
+        return 9 * (self.height + SSIM_WINDOW) * self.tiles_x * TILE
+
 
 class SceneSize(Protocol):
     """The rows and bytes of a scene on a backend, as this module needs them: see `DeviceScene`."""
@@ -199,9 +204,8 @@ def reference_bytes(size: ViewSize) -> int:
 
 
 def structure_shapes(size: ViewSize) -> Shapes:
-    """Buffers for the gradient of a view's SSIM. They end in rows that the sums of the last pixels read."""
-    stride = size.tiles_x * TILE
-    return {"taps": ((SSIM_WINDOW,), np.float32), "slopes": ((3, 3, (size.height + SSIM_WINDOW) * stride), np.float32)}
+    """Buffers for the gradient of a view's SSIM."""
+    return {"taps": ((SSIM_WINDOW,), np.float32), "slopes": ((size.slopes,), np.float32)}
 
 
 def target_bytes(scene: SceneSize, size: ViewSize) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
-from flexgs_edge.constants import DEFAULT_NEAR, DILATION, ROW_SPAN
+from flexgs_edge.constants import DEFAULT_NEAR, DILATION, ROW_SPAN, TILE
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import Backend, window
 from flexgs_edge.memory.budget import MemoryBudget
@@ -24,7 +24,7 @@ from flexgs_edge.render.chunks import QuantizedPlanes, SourcePlanes, ViewPart
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.fit import GRADIENT_SUMS, GROWTH, GUESS, MOST_SUMS, SUM_BYTES, Fit, fits_whole, saves_bytes
 from flexgs_edge.render.statistics import Statistics, SumReader
-from flexgs_edge.render.view_buffers import ViewBuffers, list_tiles, sort_splats, split_batches, view_key, view_size
+from flexgs_edge.render.view_buffers import ViewBuffers, list_tiles, sort_splats, split_batches, view_size
 from flexgs_edge.scene.source import SceneSource
 
 
@@ -146,12 +146,12 @@ class Renderer(AbstractContextManager["Renderer"]):
         """Draw a view, in the layout of the kernels: [3, H, W] f32, both sides rounded up to whole tiles."""
         view = self._prepare(scene, camera)
         self._blend(view, "blend")
-        return self.backend.read(view.buffers.image)
+        return view.buffers.picture()
 
     def drawn_planes(self) -> np.ndarray:
         """The last drawn view, also if it was drawn for sums, in the layout of `render_planes`."""
         assert self._buffers is not None
-        return self.backend.read(self._buffers.image)
+        return self._buffers.picture()
 
     def drawn_coverage(self) -> float:
         """Share of the last drawn view that its splats cover: the mean over its pixels of 1 - transmittance, in [0, 1].
@@ -310,13 +310,13 @@ class Renderer(AbstractContextManager["Renderer"]):
             if not (again and len(view.batches) == 1):
                 list_tiles(backend, buffers, camera, start, stop - start)
             backend.launch(
-                blend, (buffers.tiles,), buffers.tiles_x, backend.tile_blocks, camera.width, camera.height,
+                blend, (buffers.size.tiles,), buffers.size.tiles_x, backend.tile_blocks, camera.width, camera.height,
                 int(index > 0), int(finish and index == len(view.batches) - 1), *self.background,
                 buffers.ends, buffers.pairs, buffers.records, buffers.state, buffers.image, *extra,
             )  # fmt: skip
 
     def _view_buffers(self, scene: DeviceScene, camera: Camera) -> ViewBuffers:
-        if self._buffers is None or self._buffers.key != view_key(scene, camera):
+        if self._buffers is None or not self._buffers.serve(scene, camera):
             self.release()
             shown = self.fit.capacity(scene.count, max(1 / self.fit.first_share, GUESS * self._share))
             if scene.shown is None and self._may_be_compact(scene, camera, shown) and not self.fits(scene, camera):
@@ -368,12 +368,12 @@ class Renderer(AbstractContextManager["Renderer"]):
 def target_residual(backend: Backend, buffers: ViewBuffers, target: np.ndarray) -> Any:
     """What the drawn view lacks of `target` ([3, H, W] f16, laid out as by `Renderer.render_planes`).
 
-    The result is an array of the backend, [3 H W] f32: `target` - view.
+    The result is an array of the backend, [3 H W] f32 and more: `target` - view.
     The target must not change afterwards, since the device may read it later.
     """
     half, residual = buffers.reference_arrays()
     backend.write(half, target.reshape(-1), stays=True)
-    backend.launch("residual", (residual.shape[0],), residual.shape[0], half, buffers.image, residual)
+    backend.launch("residual", (target.size,), target.size, half, buffers.image, residual)
     return residual
 
 
@@ -390,8 +390,8 @@ def add_structure(backend: Backend, buffers: ViewBuffers, camera: Camera, weight
         return
     taps, slopes = buffers.structure_arrays(weights)
     target, residual = buffers.reference_arrays()
-    _, rows, stride = buffers.image.shape
-    across, plane, wide = -(-stride // ROW_SPAN) * ROW_SPAN, rows * stride, slopes.shape[2]
+    stride, plane = buffers.size.tiles_x * TILE, buffers.size.pixels
+    across, wide = -(-stride // ROW_SPAN) * ROW_SPAN, buffers.size.slopes // 9
     windows, columns = (side - size + 1 for side in (camera.height, camera.width))
     backend.launch(
         "dssim_slopes", (3 * windows * across,), across, windows, columns, stride, plane, wide, size, taps, buffers.image,

@@ -21,13 +21,8 @@ def view_size(backend: Backend, camera: Camera) -> fit.ViewSize:
     return fit.ViewSize(camera.width, camera.height, backend.sort_blocks, backend.tile_blocks)
 
 
-def view_key(scene: DeviceScene, camera: Camera) -> tuple[int, int, int]:
-    """The key by which buffers are reused: rows of the scene, width and height."""
-    return scene.count, camera.width, camera.height
-
-
 class ViewBuffers:
-    """Buffers for views of one size and one number of rows; reused until either changes.
+    """Buffers for views of one number of rows, and of at most so many tiles; arrays of a smaller view use their first elements.
 
     With `rows`, they are the buffers of a compact view: room for that many splats, and for one projected chunk.
     """
@@ -35,12 +30,10 @@ class ViewBuffers:
     def __init__(
         self, backend: Backend, scene: DeviceScene, camera: Camera, budget: MemoryBudget, rows: int | None = None
     ) -> None:
-        self.key = view_key(scene, camera)
-        _, width, height = self.key
         self.rows = rows
         count = scene.count if rows is None else rows
-        self.size = view_size(backend, camera)
-        self.tiles_x, self.tiles = self.size.tiles_x, self.size.tiles
+        self._scene_rows = scene.count
+        self.size = self._largest = view_size(backend, camera)
         self.arrays: list[Any] = []
         self._backend = backend
         self._references: tuple[Any, Any] | None = None
@@ -50,14 +43,15 @@ class ViewBuffers:
         size = fit.shapes_bytes(shapes)
         # A splat may touch every tile, so a batch must have room for one pair a tile. The least that the scene and the
         # sums need is checked here too, so that one error message names a limit that is large enough.
-        later = fit.PAIR_BYTES * self.tiles + scene.later_bytes + scene.least_bytes + fit.target_bytes(scene, self.size)
+        later = fit.target_bytes(scene, self.size)
+        later += fit.PAIR_BYTES * self.size.tiles + scene.later_bytes + scene.least_bytes
         what = f"a view of {count} Gaussians"
         if rows is not None:
             what = f"a view that shows {count} of {scene.count} Gaussians"
             shapes |= fit.chunk_shapes(scene.compact_rows)
             later += scene.shown_bytes * rows - scene.later_bytes
             size = fit.shapes_bytes(shapes)
-        budget.require(f"{what} at {width}x{height}", size + later)
+        budget.require(f"{what} at {camera.width}x{camera.height}", size + later)
         try:
             made = {name: self._array(shape, dtype) for name, (shape, dtype) in shapes.items()}
             if scene.references:
@@ -66,13 +60,13 @@ class ViewBuffers:
                 self.structure_room()
             later -= fit.target_bytes(scene, self.size)
             pairs = min(scene.fit.pairs, backend.most_pairs or scene.fit.pairs)
-            share, most = fit.PAIR_SHARE, max(pairs, self.tiles)
+            share, most = fit.PAIR_SHARE, max(pairs, self.size.tiles)
             if rows is not None:
                 share = fit.COMPACT_PAIR_SHARE
                 # Chunks that stay use what the tile lists leave. Buffers for views that show more rows need their room.
                 scene.give_way(later + share * most * fit.PAIR_BYTES - budget.free)
             spare = max(budget.free - later, 0) // (share * fit.PAIR_BYTES)
-            self.capacity = min(self.tiles + spare, most)
+            self.capacity = min(self.size.tiles + spare, most)
             self.pairs = self._array((self.capacity, 2), np.uint32)
             self.drafts = self._array((self.capacity, 3), np.uint32)
         except BaseException:
@@ -91,18 +85,31 @@ class ViewBuffers:
         self.arrays.append(made)
         return made
 
+    def serve(self, scene: DeviceScene, camera: Camera) -> bool:
+        """Take the size of a view; False if they have no room for it."""
+        size, most = view_size(self._backend, camera), self._largest
+        if scene.count != self._scene_rows or size.tiles > most.tiles or size.slopes > most.slopes:
+            return False
+        if size != self.size:
+            self.size, self._window = size, 0
+        return True
+
+    def picture(self) -> np.ndarray:
+        """[3, H, W] f32, the drawn view; both sides are rounded up to whole tiles."""
+        shape = fit.view_shapes(self.size, 0)["image"][0]
+        return self._backend.read(self.image, np.empty(shape, np.float32))
+
     def coverage(self) -> float:
         """Mean over the view's pixels of 1 - transmittance, from `state` after the last batch.
 
         A pixel that has ended keeps its transmittance with the sign flipped. Those outside the picture have -1.
         """
         covered = 0.0
-        for first in range(0, self.tiles, TILES_AT_ONCE):
-            part = np.empty((min(TILES_AT_ONCE, self.tiles - first), *self.state.shape[1:]), np.float32)
+        for first in range(0, self.size.tiles, TILES_AT_ONCE):
+            part = np.empty((min(TILES_AT_ONCE, self.size.tiles - first), *self.state.shape[1:]), np.float32)
             self._backend.read(self.state, part, first * part[0].size)
             covered += float(np.sum(1.0 - np.abs(part[:, 3]).astype(np.float64)))
-        _, width, height = self.key
-        return covered / (width * height)
+        return covered / (self.size.width * self.size.height)
 
     def blocks(self, count: int) -> Any:
         """An array for the numbers of `count` blocks ([.] u32); kept until more are asked for."""
@@ -115,7 +122,7 @@ class ViewBuffers:
     def reference_arrays(self) -> tuple[Any, Any]:
         """The target image (f16) and the residual against it (f32), allocated at the first call."""
         if self._references is None:
-            pixels = 3 * self.size.pixels
+            pixels = 3 * self._largest.pixels
             self._references = (self._array((pixels,), np.float16), self._array((pixels,), np.float32))
         return self._references
 
@@ -127,13 +134,13 @@ class ViewBuffers:
         taps, slopes = self._structure or self.structure_room()
         if len(weights) != self._window:
             self._backend.write(taps, weights)
-            self._backend.fill(slopes, 0)
+            self._backend.fill(slopes, 0, self.size.slopes)
             self._window = len(weights)
         return taps, slopes
 
     def structure_room(self) -> tuple[Any, Any]:
         """Allocate the arrays for the gradient of SSIM."""
-        taps, slopes = (self._array(shape, dtype) for shape, dtype in fit.structure_shapes(self.size).values())
+        taps, slopes = (self._array(shape, dtype) for shape, dtype in fit.structure_shapes(self._largest).values())
         self._structure = taps, slopes
         return taps, slopes
 
@@ -172,7 +179,7 @@ def split_batches(backend: Backend, buffers: ViewBuffers, shown: int) -> list[tu
     The device counts pairs piece by piece: the counts of millions of splats would take more of the host than a limit allows.
     """
     batches, start, stop, held = [], 0, 0, 0
-    most = backend.tile_blocks * MOST_COUNTED // buffers.tiles
+    most = backend.tile_blocks * MOST_COUNTED // buffers.size.tiles
     for first in range(0, shown, most):
         for end, pairs in _pieces(backend, buffers, first, min(most, shown - first)):
             if held + pairs > buffers.capacity:
@@ -204,7 +211,7 @@ def list_tiles(backend: Backend, buffers: ViewBuffers, camera: Camera, start: in
         "tile_count", (blocks,), start, count, camera.width, camera.height, ids, buffers.records,
         buffers.pair_room, buffers.drafts, buffers.ends,
     )  # fmt: skip
-    backend.launch("exclusive_scan", (1,), buffers.tiles, blocks, buffers.ends)
+    backend.launch("exclusive_scan", (1,), buffers.size.tiles, blocks, buffers.ends)
     backend.launch(
-        "tile_scatter", (blocks,), buffers.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
+        "tile_scatter", (blocks,), buffers.size.tiles, buffers.pair_room, buffers.drafts, buffers.ends, buffers.pairs
     )

@@ -9,7 +9,8 @@ from skimage.metrics import structural_similarity
 from flexgs_edge.errors import BudgetError
 from flexgs_edge.kernels.backend import TwinBackend
 from flexgs_edge.memory.budget import MemoryBudget
-from flexgs_edge.quality.similarity import ssim_bytes, ssims
+from flexgs_edge.quality import similarity
+from flexgs_edge.quality.similarity import flips, ssim_bytes, ssims
 from kernel_fixtures import ALL_FORMS, open_form
 
 
@@ -50,3 +51,17 @@ def test_what_it_takes_is_what_it_says_and_comes_back() -> None:
     assert budget.used == 0
     with pytest.raises(BudgetError):
         ssims(TwinBackend(MemoryBudget(size * 3 // 4)), [(a, b)])
+
+
+@pytest.mark.parametrize("part", [(20, 23, 30, 31), (0, 1, 0, 1), (56, 57, 130, 131), (0, 0, 0, 0)])
+def test_pictures_that_differ_in_a_part_alone_have_the_figures_of_the_whole(
+    part: tuple[int, int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    top, bottom, left, right = part
+    a, noisy = images(57, 131, 0.5)
+    b = a.copy()
+    b[top:bottom, left:right] = noisy[top:bottom, left:right]
+    backend = open_form("w8")
+    found = ssims(backend, [(a, b)]), flips(backend, [(a, b)])
+    monkeypatch.setattr(similarity, "_differing", lambda pairs, reach: pairs)
+    assert found == (ssims(backend, [(a, b)]), flips(backend, [(a, b)]))

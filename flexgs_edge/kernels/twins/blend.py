@@ -134,6 +134,9 @@ def blend(
     """
     tile_ends = np.concatenate([[0], ends[(blocks - 1) * size[0] : blocks * size[0]].astype(np.int64)])
     background = np.array([background_r, background_g, background_b], f32)
+    pixels = 3 * size[0] * TILE**2  # arrays may have room for larger views
+    image = image.reshape(-1)[:pixels].reshape(3, -1, tiles_x * TILE)
+    rest = None if rest is None else rest.reshape(-1)[:pixels].reshape(image.shape)
     for first in range(0, size[0], TILES_AT_ONCE):
         last = min(first + TILES_AT_ONCE, size[0])
         counts = np.diff(tile_ends[first : last + 1])
@@ -150,7 +153,7 @@ def blend(
             colour = np.zeros((3, len(unit), 16), f32)
             trans = np.where((px < f32(width)) & (py < f32(height)), f32(1), f32(-1))
         ys, xs = py.astype(np.int64), px.astype(np.int64)
-        own_rest = None if rest is None else rest.reshape(image.shape)[:, ys, xs]
+        own_rest = None if rest is None else rest[:, ys, xs]
         whole = image[:, ys, xs] if stats in (2, 4, 5) else None
         if stats == 5 and not resume and whole is not None and own_rest is not None:
             # The light still to come in a pixel, times the residual, is kept in the place of red.

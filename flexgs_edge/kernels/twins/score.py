@@ -9,7 +9,7 @@ from flexgs_edge.kernels.twins.project import block_rows, sh_basis
 
 def residual(size: Size, count: int, target: Array, image: Array, out: Array) -> None:
     """`target` (f16) minus `image` (f32), pixel by pixel."""
-    out[:] = target.astype(f32) - image.reshape(-1)
+    out[:count] = target[:count].astype(f32) - image.reshape(-1)[:count]
 
 
 def _sum_values(sums: Array, unit: float) -> Array:

@@ -61,7 +61,7 @@ def dssim_slopes(
         both = (two * (m[4] - ab) + f32(SSIM_C2)) / variances
         by_mean = both * (m[1] - light * m[0]) / means + light * (both * m[0] - m[1]) / variances
         found = two * by_mean, -(light * both / variances), two * light / variances
-        for plane_of, value in zip(slopes.reshape(3, 3, wide)[channel], found, strict=True):
+        for plane_of, value in zip(slopes.reshape(-1)[: 9 * wide].reshape(3, 3, wide)[channel], found, strict=True):
             plane_of[at : at + count] = np.where(inside, value, f32(0))
 
 
@@ -72,7 +72,7 @@ def dssim_residual(
     """Add the gradient of all windows' SSIM by `image`, times `factor`, to `residual`."""
     count = rows * stride
     for channel in range(3):
-        own_slopes = slopes.reshape(3, 3, wide)[channel]
+        own_slopes = slopes.reshape(-1)[: 9 * wide].reshape(3, 3, wide)[channel]
         sums, by = np.zeros((3, count + size), f32), np.zeros((3, count), f32)
         for k in range(size):
             sums[:, :count] += taps[k] * own_slopes[:, k * stride : k * stride + count]

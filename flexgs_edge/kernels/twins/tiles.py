@@ -91,7 +91,8 @@ def tile_count(
     block = block_of(count, size[0])[splat]
     room[1] = np.bincount(block, minlength=size[0])
     drafts[_draft_places(room)] = np.stack([batch[splat], tile, mask], axis=1)
-    counts[:-1] = np.bincount(block * (len(counts) // size[0]) + tile, minlength=len(counts) - 1)
+    tiles = -(-int(width) // TILE) * -(-int(height) // TILE)
+    counts[: size[0] * tiles] = np.bincount(block * tiles + tile, minlength=size[0] * tiles)
 
 
 def tile_scatter(size: Size, tiles: int, room: Array, drafts: Array, offsets: Array, pairs: Array) -> None:
@@ -101,4 +102,4 @@ def tile_scatter(size: Size, tiles: int, room: Array, drafts: Array, offsets: Ar
     pairs[: len(order), 0] = row[order]
     pairs[: len(order), 1] = mask[order]
     cells = np.repeat(np.arange(size[0]), room[1]) * tiles + tile
-    offsets[:-1] += np.bincount(cells, minlength=len(offsets) - 1).astype(np.uint32)
+    offsets[: size[0] * tiles] += np.bincount(cells, minlength=size[0] * tiles).astype(np.uint32)
