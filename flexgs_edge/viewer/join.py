@@ -14,12 +14,13 @@ _IMPORT = re.compile(r"^import (?:\{([^}]*)\} from )?'([^']+)';$", re.MULTILINE)
 _EXPORT_FROM = re.compile(r"^export \{([^}]*)\} from '([^']+)';$", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function\*?|class|const) \w+)", re.MULTILINE)
 _NAME = re.compile(r"^(?:async )?(?:function\*?|class|const|let) (\w+)", re.MULTILINE)
-_NUMBER = re.compile(r"^const ([A-Z][A-Z0-9_]*) = (\d[0-9a-fx .*/<-]*);\n", re.MULTILINE)
+_NUMBER = re.compile(r"^const ([A-Z][A-Z0-9_]*) = (\d[0-9a-fx .*/<-]*);(?: //.*)?\n", re.MULTILINE)
 _LOCAL = re.compile(r"(?<=[ (])const (?=\w+ (?:=|of) |[\[{])")  # In functions: of others, engines know that they stay
 _LEFT = re.compile(r"^(?:import|export|const [{[]|let [{[]).*$", re.MULTILINE)
 _OUTSIDE = re.compile(r"\b(?:uniform|in|out) [^;(){}]*;")  # Names that the page or another shader of GLSL knows
 _DECLARED = re.compile(r"\b(?:float|int|u?vec[234]|mat3|void) (\w+)|, (\w+) = ")
 _DIGITS = re.compile(r"\d+\.\d{9,}")
+_ZERO = re.compile(r"\b0(?=\.0*[1-9])|(?<=\d\.)0\b")  # GLSL knows .5 and 1.
 
 
 def shorten_script(text: str) -> str:
@@ -102,7 +103,7 @@ def _check_names(parts: Mapping[str, str]) -> None:
 def shorten_shader(text: str) -> str:
     """A shader without comments, indentation and most spaces, with short names and no digits that float32 cannot hold."""
     text = re.sub(r"\n\s+", "\n", re.sub(r"[ \t]*//[^\n]*", "", text))
-    text = _DIGITS.sub(lambda found: f"{float(found[0]):.9g}", _renamed(text))
+    text = _ZERO.sub("", _DIGITS.sub(lambda found: f"{float(found[0]):.9g}", _renamed(text)))
     text = re.sub(r" ?([*/=<>(){},;?:&|!]+) ?", r"\1", text)
     text = re.sub(r"(?<=[(){},;])\n(?!#)", "", text)
     # Two signs beside each other would become another one.

@@ -15,7 +15,7 @@ from flexgs_edge.viewer.join import shorten_script, shorten_shader, shorten_styl
 
 def test_shaders_lose_what_only_readers_need() -> None:
     script = "const a = `#version 300 es\n  // why\n  int a = - -1;  // b\n  f( b ) [c & 1] / 2.0;\n`;"
-    assert "#version 300 es\nint a=- -1;f(b)[c&1]/2.0;`" in shorten_script(script)
+    assert "#version 300 es\nint a=- -1;f(b)[c&1]/2.;`" in shorten_script(script)
 
 
 def test_names_of_shaders_become_short_but_for_those_that_others_know() -> None:
@@ -26,9 +26,14 @@ def test_names_of_shaders_become_short_but_for_those_that_others_know() -> None:
     )
     assert shorten_shader(text) == (
         "layout(location=0)in uint row;uniform float near;flat out vec2 centre;"
-        "float b(float near,vec3 c){float a=near- -1.0,d=c.x+c.place;i++;"
-        "return 0.282094792*d*near;}void main(){centre=vec2(b(near,row.xyz));}"
+        "float b(float near,vec3 c){float a=near- -1.,d=c.x+c.place;i++;"
+        "return .282094792*d*near;}void main(){centre=vec2(b(near,row.xyz));}"
     )
+
+
+def test_numbers_of_shaders_lose_zeros() -> None:
+    text = "vec4(0.0, 10.05, 20.0, 0.05) * t0.x + 1.0e5 - 0.30 + 0;"
+    assert shorten_shader(text) == "vec4(0.,10.05,20.,.05)*t0.x+1.0e5-.30+0;"
 
 
 def test_other_templates_stay() -> None:

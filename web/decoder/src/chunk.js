@@ -94,16 +94,8 @@ function fillTriple(values, rows, scaled, means, away) {
 }
 
 function checkDegrees(codes, most) {
-  let [lowest, highest] = [0, 0];
-  for (const code of codes) {
-    if (code < lowest) lowest = code;
-    if (code > highest) highest = code;
-  }
-  if (lowest < 0 || highest > most) {
-    // The least of all codes, as the program says it.
-    lowest = codes.reduce((a, b) => Math.min(a, b), highest);
-    throw new StreamError(`sh degree: wanted 0 to ${most}, got ${lowest} to ${codes.reduce((a, b) => Math.max(a, b), lowest)}`);
-  }
+  const [lowest, highest] = [Math.min, Math.max].map((better) => codes.reduce((a, b) => better(a, b), codes[0]));
+  if (lowest < 0 || highest > most) throw new StreamError(`sh degree: wanted 0 to ${most}, got ${lowest} to ${highest}`);
 }
 
 /** For each degree: the rows that have it, and the planes of all Y, all Co, all Cg of its coefficients. */

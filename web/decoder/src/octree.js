@@ -31,7 +31,7 @@ export function readCells(stream, model, rows) {
     count = children;
   }
   const repeats = new Float64Array(count);
-  readRepeats(stream, model.repeats, count, bytes, repeats);
+  readRepeats(stream, model.repeats, count, contexts.fill(0), bytes, repeats);
   let sum = 0;
   for (let i = 0; i < count; i++) sum += repeats[i];
   if (sum + count !== rows) throw new StreamError(`repeats: wanted ${rows - count} in all, got ${sum}`);
@@ -79,8 +79,8 @@ function fillChildren(x, y, z, bytes, count, toX, toY, toZ, siblings) {
 }
 
 /** Rows beyond the first of each cell; an escape's number is 32 bits, not what is beyond the escape. */
-function readRepeats(stream, tables, count, symbols, repeats) {
-  stream.getPlain(tables, count, symbols);
+function readRepeats(stream, tables, count, contexts, symbols, repeats) {
+  stream.get(tables, contexts, count, symbols);
   let escapes = 0;
   for (let i = 0; i < count; i++) {
     if (symbols[i] === ESCAPE) escapes++;

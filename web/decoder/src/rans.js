@@ -73,12 +73,8 @@ export class Decoder {
    * @param {Tables} tables
    */
   get(tables, contexts, count, out) {
-    this.#moved(decodeBatch(this.states, this.words, this.at, tables, contexts, count, out));
-  }
-
-  /** A batch without contexts. */
-  getPlain(tables, count, out) {
-    this.#moved(decodePlain(this.states, this.words, this.at, tables.starts, tables.buckets, count, out));
+    const { starts, buckets, mapping, size } = tables;
+    this.#moved(decodeRows(this.states, this.words, this.at, starts, buckets, mapping, size + 1, contexts, count, out));
   }
 
   /** Add raw numbers of `bits` bits to `out`, each times 2^at. */
@@ -106,12 +102,6 @@ export class Decoder {
 
 // The loops below take typed arrays and numbers only: engines compile them once and keep them.
 
-function decodeBatch(states, words, at, tables, contexts, count, out) {
-  return decodeRows(
-    states, words, at, tables.starts, tables.buckets, tables.mapping, tables.size + 1, contexts, count, out,
-  ); // prettier-ignore
-}
-
 function decodeRows(states, words, at, starts, buckets, mapping, width, contexts, count, out) {
   const last = states.length - 1;
   for (let i = 0; i < count; i++) {
@@ -124,24 +114,6 @@ function decodeRows(states, words, at, starts, buckets, mapping, width, contexts
     let next = starts[first + symbol + 1];
     while (next <= slot) next = starts[first + ++symbol + 1];
     const start = starts[first + symbol];
-    let y = (Math.imul(next - start, x >>> 14) + slot - start) | 0;
-    if (y >>> 16 === 0) y = (y << 16) | words[at++];
-    states[lane] = y;
-    out[i] = symbol;
-  }
-  return at;
-}
-
-function decodePlain(states, words, at, starts, buckets, count, out) {
-  const last = states.length - 1;
-  for (let i = 0; i < count; i++) {
-    const lane = i & last;
-    const x = states[lane];
-    const slot = x & 16383;
-    let symbol = buckets[slot >> 5];
-    let next = starts[symbol + 1];
-    while (next <= slot) next = starts[++symbol + 1];
-    const start = starts[symbol];
     let y = (Math.imul(next - start, x >>> 14) + slot - start) | 0;
     if (y >>> 16 === 0) y = (y << 16) | words[at++];
     states[lane] = y;

@@ -1,25 +1,13 @@
 const SINGLE = new Float32Array(1);
 const SINGLE_BITS = new Uint32Array(SINGLE.buffer);
 
-/** The bits of the nearest half float; values beyond its range are cut off. */
+/** The bits of the nearest half float, of two the even one; values beyond its range are cut off. */
 export function toHalf(value) {
-  SINGLE[0] = Math.min(65504, Math.max(-65504, value));
-  const bits = SINGLE_BITS[0];
-  const sign = (bits >>> 16) & 0x8000;
-  const exponent = ((bits >>> 23) & 255) - 112;
-  const fraction = bits & 0x7fffff;
-  if (exponent <= 0) {
-    if (exponent < -10) return sign;
-    const whole = fraction | 0x800000;
-    return sign | rounded(whole, 14 - exponent);
-  }
-  return sign | rounded((exponent << 23) | fraction, 13);
-}
-
-/** Shift right, to the nearest, ties to even. */
-function rounded(number, shift) {
-  const kept = number >>> shift;
-  const rest = number & ((1 << shift) - 1);
-  const middle = 1 << (shift - 1);
-  return kept + (rest > middle || (rest === middle && kept & 1) ? 1 : 0);
+  const size = Math.min(65504, Math.abs(value));
+  const small = size < 2 ** -14;
+  // A single has the steps of small halves from 1/2 on, so that the sum rounds to them.
+  SINGLE[0] = small ? size + 0.5 : size;
+  const [bits] = SINGLE_BITS;
+  const sign = value < 0 ? 0x8000 : 0;
+  return sign | (small ? bits - 0x3f000000 : (bits + 0xfff + ((bits >>> 13) & 1) - 0x38000000) >>> 13);
 }
