@@ -45,7 +45,7 @@ _SCENE_NAME = "scene.fgs"
 _SCENE = f"viewer/{_SCENE_NAME}"
 PAGE_MOST = 100_000_000  # Bytes of a page that phones and mail still take
 NOTES_MOST = 1000  # Most notes of a page, which places all of them with every frame
-POSTER_SIZE, POSTER_QUALITY = (960, 540), 70  # It comes before the scene on slow networks, so it is small
+POSTER_SIZE, POSTER_QUALITY = (960, 540), 60  # It comes before the scene on slow networks, so it is small
 
 
 def view(
@@ -160,7 +160,7 @@ def _poster(run: Run[ViewOptions], start: StartView | None) -> bytes | None:
     except (BudgetError, DeviceError) as error:
         LOG.warning("warning: the folder has no poster, since nothing can draw it: %s", error)
         return None
-    return encode(picture, POSTER_SIZE, POSTER_QUALITY)
+    return encode(picture, POSTER_SIZE, POSTER_QUALITY, short=True)
 
 
 def _kind(scene: Path) -> str:

@@ -90,8 +90,8 @@ def draw_shots(
     return tuple(shots)
 
 
-def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY) -> bytes:
-    """Encode [H, W, 3] f32 in [0, 1] as JPEG, scaled down to `size` by area. Chroma keeps its full resolution."""
+def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY, short: bool = False) -> bytes:
+    """Encode [H, W, 3] f32 in [0, 1] as JPEG, scaled down to `size` by area. Chroma keeps its full resolution, unless `short`."""
     from PIL import Image
 
     pixels = np.rint(np.clip(image, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
@@ -99,7 +99,7 @@ def encode(image: np.ndarray, size: tuple[int, int], quality: int = JPEG_QUALITY
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BOX)
     out = io.BytesIO()
-    picture.save(out, "JPEG", quality=quality, subsampling=0)
+    picture.save(out, "JPEG", quality=quality, subsampling=2 if short else 0, optimize=short, progressive=short)
     return out.getvalue()
 
 
