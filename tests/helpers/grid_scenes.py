@@ -60,9 +60,7 @@ def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:
 
 def levelled(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path, Path]:
     """The same scene in one layer with levels of every fourth and every sixteenth row, and the files of these levels."""
-    grid = grid_of(scene)
-    order = np.argsort(_cells_of_one_layer(grid), kind="stable")
-    grid = replace(grid.take(order), layer=np.zeros_like(grid.layer))
+    grid = one_layer(grid_of(scene))
     chunks = (np.arange(grid.count) // chunk_rows).astype(np.uint8)
     places, preview = [folder / f"{name}.fgs" for name in ("coarse", "level", "levelled")], b""
     for place, thinned in zip(places, (16, 4), strict=False):
@@ -72,6 +70,12 @@ def levelled(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path, Pa
         preview = place.read_bytes()
     write_grid(places[-1], grid, {}, chunk_rows=chunk_rows, preview=preview)
     return places[2], places[1], places[0]
+
+
+def one_layer(grid: GridScene) -> GridScene:
+    """The same rows in one layer."""
+    order = np.argsort(_cells_of_one_layer(grid), kind="stable")
+    return replace(grid.take(order), layer=np.zeros_like(grid.layer))
 
 
 def grid_of(scene: Path) -> GridScene:

@@ -13,7 +13,7 @@ from browser import Browser
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.codec.v2.grid_source import GridSource
-from grid_scenes import previewed, sample_grid
+from grid_scenes import grid_of, one_layer, previewed, sample_grid
 from viewer_tab import LOOK, POSES, Drawn, decibels, faults, go, picture, served, until
 
 SMALL, LARGE = 256, 8192
@@ -44,7 +44,9 @@ def holes(got: np.ndarray, wanted: np.ndarray) -> float:
     return float(((empty < 8) & (other > 30)).mean())
 
 
-@pytest.mark.parametrize(("chunk_rows", "preview"), [(SMALL, False), (None, False), (LARGE, False), (LARGE, True)])
+@pytest.mark.parametrize(
+    ("chunk_rows", "preview"), [(SMALL, False), (None, False), (LARGE, False), (LARGE, True), (SMALL, True)]
+)
 def test_a_full_budget_leaves_no_holes(
     tab: Browser, scene: Path, sample_dir: Path, drawn: Drawn, tmp_path: Path, chunk_rows: int | None, preview: bool
 ) -> None:
@@ -81,7 +83,8 @@ def test_few_splats_of_a_scene_look_like_all(tab: Browser, sample_dir: Path, tmp
 
 def test_beside_a_preview_chunks_in_sight_are_held(tab: Browser, scene: Path, sample_dir: Path, tmp_path: Path) -> None:
     """What was out of sight goes when the camera turns to what is missing."""
-    budget, (place, small) = 12 * SMALL, previewed(scene, tmp_path, SMALL)
+    write_grid(tmp_path / "one_layer.fgs", one_layer(grid_of(scene)), {})
+    budget, (place, small) = 12 * SMALL, previewed(tmp_path / "one_layer.fgs", tmp_path, SMALL)
     with served(place, str(sample_dir / "cameras.json"), **LOOK) as address:
         go(tab, f"{address}?splats={budget}")
         held = "viewer.space.parts.filter((part) => part.here)"

@@ -15,18 +15,19 @@ const WIDER = 1.2;
 export class Space {
   /**
    * @param {object} header of the worker
-   * @param {number} budget most rows to hold; beside a preview, one chunk is held at least
+   * @param {number} budget most rows to hold; beside a preview and without layers, whole chunks, and one at least
    */
   constructor(header, budget) {
     this.parts = partsOf(header);
     const [rows, shRows] = ['rows', 'shRows'].map((name) => Math.max(...this.parts.map((part) => part[name])));
     const fits = header.count <= budget;
     /** The share of each chunk's rows that there is room for. */
-    this.share = fits || header.preview ? 1 : budget / header.count;
+    this.share = fits || (header.preview && header.layers.length < 2) ? 1 : budget / header.count;
     const most = Math.min(this.parts.length, Math.max(1, Math.floor(budget / rows)));
     this.free = fits || this.share < 1 ? ownPlaces(this.parts, this.share) : equalPlaces(most, rows, shRows);
     const end = this.free.at(-1);
-    this.room = { count: end.start + end.rows, shRows: end.shStart + end.shRows, shDegree: header.shDegree };
+    // A chunk of which nothing is kept has its place inside, too.
+    this.room = { count: end.start + Math.max(end.rows, 1), shRows: end.shStart + end.shRows, shDegree: header.shDegree };
   }
 
   /** Whether a header tells where each chunk lies. */

@@ -51,7 +51,8 @@ export class SpatialViewer extends PreviewViewer {
   }
 
   thinned(whole) {
-    return this.space ? super.thinned(whole, this.share, whole.start, whole.shStart) : super.thinned(whole);
+    if (!this.space) return super.thinned(whole);
+    return super.thinned(whole, this.isPreview(whole) ? 1 : this.share, whole.start, whole.shStart);
   }
 
   get growth() {
@@ -62,11 +63,14 @@ export class SpatialViewer extends PreviewViewer {
     return ((missing * (cutFrom ?? { count }).count) / count) ** GROWTH_POWER;
   }
 
+  /** Whether a chunk lies behind the room of the scene. */
+  isPreview({ start }) {
+    return start >= this.space.room.count;
+  }
+
   async loaded(data) {
     const { chunk } = data;
-    // Behind the room of the scene lies the preview, but also the place of a chunk of which nothing is kept.
-    const own = chunk && this.space && !(this.spacePreview && chunk.start >= this.space.room.count);
-    if (own) {
+    if (chunk && this.space && !this.isPreview(chunk)) {
       this.asking--;
       this.space.arrived(chunk.index);
     } else if (chunk) this.spacePreview?.add(chunk);

@@ -61,8 +61,8 @@ test('each chunk has its place in the order of the file, and the room is that of
   assert.deepEqual([places[2].shStart, places[2].shEnd, places[3].shStart], [1, 3, 3]);
 });
 
-test('over the budget, all chunks lose the same share of their rows', () => {
-  const space = new Space(header(), 45);
+test('over the budget, all chunks lose the same share of their rows; with layers beside a preview, too', () => {
+  const space = new Space(header({ preview: {} }), 45);
   assert.equal(space.share, 45 / 157);
   assert.deepEqual(space.room, { count: 15 * 2 + 2, shRows: 15, shDegree: 1 });
   space.look(view(14));
@@ -75,12 +75,12 @@ test('over the budget, all chunks lose the same share of their rows', () => {
 });
 
 test('over the budget and beside a preview, chunks out of sight give way to better ones, and no others', () => {
-  const space = new Space(header({ preview: {} }), 45);
+  const space = new Space(header({ preview: {}, layers: [157] }), 45);
   assert.equal(space.share, 1);
   assert.deepEqual(space.room, { count: 40, shRows: 8, shDegree: 1 });
   space.look(view(-14));
   const first = order(space);
-  assert.deepEqual(first, [0, 8, 1, 2]);
+  assert.deepEqual(first, [0, 8, 1, 9]);
   assert.equal(space.complete, false);
   first.forEach((index) => space.arrived(index));
   assert.equal(space.next(), null, 'nothing that is missing is better');
@@ -89,14 +89,14 @@ test('over the budget and beside a preview, chunks out of sight give way to bett
   assert.equal(space.missing, 1, 'nothing of what is in sight is there');
   const part = space.next();
   assert.equal(part.index, 7);
-  assert.equal(part.place.start, 10, 'the place of the chunk of the second layer, the worst one');
+  assert.equal(part.place.start, 10, 'the place of the farthest one');
   space.arrived(7);
   assert.equal(space.missing, 17 / 10);
   assert.deepEqual(order(space), [15]);
 });
 
 test('a chunk that was asked for and is not here yet keeps its place', () => {
-  const space = new Space(header({ preview: {} }), 20);
+  const space = new Space(header({ preview: {}, layers: [157] }), 20);
   space.look(view(-14));
   assert.deepEqual(order(space), [0, 8]);
   space.look(view(14));
