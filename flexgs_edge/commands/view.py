@@ -7,7 +7,7 @@ import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from flexgs_edge.packed.bitpack import BitSpec
 from flexgs_edge.packed.quantize import far_contraction, quantize_scene
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.report.file_results import ViewResult
+from flexgs_edge.run.fine_file import write_fine
 from flexgs_edge.run.inputs import scene_info
 from flexgs_edge.run.open_renderer import load_drawn, open_renderer
 from flexgs_edge.run.open_scene import is_fgs, scene_file
@@ -63,7 +64,7 @@ def view(
 ) -> ViewResult:
     """Look at a scene in the browser.
 
-    `input`: a scene file or a model folder. A `.fgs` is shown as it is, other scenes with 16 bits a value. `output`: a name
+    `input`: a scene file or a model folder. A `.fgs` is shown as it is, other scenes are coded finely. `output`: a name
     that ends in .html for a page of one file, which opens from disk without a network; else a folder, for the files of a web
     site. Default: serve until interrupted. `host`, `port`:
     where to serve. Default: this machine alone, any free port. Returns what was shown, and where.
@@ -179,21 +180,22 @@ def _open(address: str) -> None:
 
 @contextmanager
 def _coded(run: Run[ViewOptions], path: str | os.PathLike[str]) -> Iterator[Path]:
-    """The scene as a `.fgs`: the file itself, or a temporary one of version 1, which takes no search."""
+    """The scene as a `.fgs`: the file itself, or a temporary one, which takes no search."""
     place = scene_file(path)
     as_it_is = run.options.frame is None and not run.options.drop_invalid and run.options.crop is None
     if is_fgs(place) and as_it_is and run.scene.input_sh_degree == run.source.sh_degree:
         yield place
         return
     source = run.source
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flexgs-view-")))
-        has_sh, contraction = nonzero_sh(source), far_contraction(source)
-        rows = np.flatnonzero(has_sh), np.flatnonzero(~has_sh)
-        quantized = quantize_scene(source, *rows, FINE, contraction=contraction)
-        start = run.scene.start if run.views is None else run.views.start(source)
-        write_container(folder / "scene.fgs", quantized, {} if start is None else {START: start.to_json()})
-        yield folder / "scene.fgs"
+    start = run.scene.start if run.views is None else run.views.start(source)
+    settings = {} if start is None else {START: start.to_json()}
+    with tempfile.TemporaryDirectory(prefix="flexgs-view-") as folder:
+        coded = Path(folder) / _SCENE_NAME
+        if not write_fine(coded, run, settings):
+            has_sh, contraction = nonzero_sh(source), far_contraction(source)
+            rows = np.flatnonzero(has_sh), np.flatnonzero(~has_sh)
+            write_container(coded, quantize_scene(source, *rows, FINE, contraction=contraction), settings)
+        yield coded
 
 
 def read_notes(path: str | os.PathLike[str]) -> list[dict[str, Any]]:

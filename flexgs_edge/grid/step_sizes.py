@@ -99,3 +99,25 @@ def plane_ranges(planes: np.ndarray) -> list[tuple[np.float32, np.float32]]:
             low, high = min(low, part.min()), max(high, part.max())
         ranges.append((low, high))
     return ranges
+
+
+def holdable(steps: StepSizes, planes: Planes) -> StepSizes:
+    """`steps`, with coarser ones where codes could not hold the planes' values, and positions contracted if they need it."""
+
+    def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
+        return max((float(max(-low, high)) for low, high in plane_ranges(planes[name])), default=0.0) / codes
+
+    least = 2.0**-70
+    position, contraction = position_grid(planes["means"], max(steps.position, least))
+    colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move the coefficients
+    finest_sh = finest("sh_rest", colours)
+    return StepSizes(
+        position=position,
+        scale=max(steps.scale, finest("log_scales"), least),
+        rotation=max(steps.rotation, 2 / CODE_LIMIT),
+        opacity=max(steps.opacity, finest("opacity_logits"), least),
+        dc=max(steps.dc, finest("sh_dc", colours), least),
+        sh=tuple(max(step, finest_sh, least) for step in steps.sh),
+        chroma=steps.chroma,
+        contraction=contraction,
+    )

@@ -15,7 +15,7 @@ import numpy as np
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import CODE_LIMIT, SH_C0
-from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes, plane_ranges, position_grid
+from flexgs_edge.grid.step_sizes import POSITION_BITS, StepSizes
 from flexgs_edge.memory.rows import put_rows, read_ahead
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.rotations import tilted, turned
@@ -118,28 +118,6 @@ def choose_steps(
     bands = tuple(colour(weight2[degrees >= max(level, 1)]) for level in range(1, sh_degree + 1))
     geometry: dict[str, Any] = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}
     return StepSizes(**geometry, dc=colour(weight2), sh=bands, chroma=CHROMA)
-
-
-def holdable(steps: StepSizes, planes: dict[str, np.ndarray]) -> StepSizes:
-    """`steps`, with coarser ones where codes could not hold the planes' values, and positions contracted if they need it."""
-
-    def finest(name: str, codes: int = CODE_LIMIT - 2) -> float:
-        return max((float(max(-low, high)) for low, high in plane_ranges(planes[name])), default=0.0) / codes
-
-    least = 2.0**-70
-    position, contraction = position_grid(planes["means"], max(steps.position, least))
-    colours = CODE_LIMIT // 4  # Co reaches twice the coefficients, and refits move the coefficients
-    finest_sh = finest("sh_rest", colours)
-    return StepSizes(
-        position=position,
-        scale=max(steps.scale, finest("log_scales"), least),
-        rotation=max(steps.rotation, 2 / CODE_LIMIT),
-        opacity=max(steps.opacity, finest("opacity_logits"), least),
-        dc=max(steps.dc, finest("sh_dc", colours), least),
-        sh=tuple(max(step, finest_sh, least) for step in steps.sh),
-        chroma=steps.chroma,
-        contraction=contraction,
-    )
 
 
 def reachable(steps: StepSizes, planes: dict[str, np.ndarray], seen: np.ndarray) -> np.ndarray:

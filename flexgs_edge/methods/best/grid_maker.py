@@ -12,10 +12,10 @@ from flexgs_edge.goals.promise import excesses
 from flexgs_edge.goals.steps import better
 from flexgs_edge.goals.target import Target
 from flexgs_edge.grid.grid_scene import GridScene, values_of
-from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.step_sizes import StepSizes, holdable
 from flexgs_edge.grid.to_grid import lowered, recolour, to_grid
 from flexgs_edge.methods.best.allocation import BitModel, Guess, Kept, Measure, Selection, choose
-from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, holdable, probe_slopes, reachable
+from flexgs_edge.methods.best.choose_steps import Slopes, choose_steps, probe_slopes, reachable
 from flexgs_edge.methods.best.costs import RemovalCosts, Snapshot, cost_bytes, measure_costs
 from flexgs_edge.methods.best.effort import Effort
 from flexgs_edge.methods.best.landing import REACH, land, land_on_quality

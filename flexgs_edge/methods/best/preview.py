@@ -20,11 +20,10 @@ from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.codec.v2.container import GridContainer, write_grid
 from flexgs_edge.constants import DILATION
 from flexgs_edge.grid.grid_scene import GridScene, values_of
-from flexgs_edge.grid.step_sizes import StepSizes
+from flexgs_edge.grid.step_sizes import StepSizes, holdable
 from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.memory.storage import Storage
 from flexgs_edge.methods.best.allocation import BitModel
-from flexgs_edge.methods.best.choose_steps import holdable
 from flexgs_edge.methods.best.effort import STEP_UNIT
 from flexgs_edge.methods.best.layers import worthiest
 from flexgs_edge.methods.best.refit.finetune import Schedule, finetune

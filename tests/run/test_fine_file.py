@@ -1,0 +1,58 @@
+"""Large scenes that were never compressed, for the viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from flexgs_edge.codec.open_fgs import open_fgs
+from flexgs_edge.codec.v2.container import BOXES, GridContainer, write_grid
+from flexgs_edge.commands.evaluate import evaluate
+from flexgs_edge.grid.step_sizes import holdable
+from flexgs_edge.grid.to_grid import to_grid
+from flexgs_edge.io.ply import write_ply
+from flexgs_edge.memory.storage import IN_MEMORY
+from flexgs_edge.progress import SILENT
+from flexgs_edge.run.fine_file import LEAST_FINE, fine_steps, write_fine
+from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
+from flexgs_edge.run.run import Run, open_run
+from flexgs_edge.scene.source import MemorySource, read_all
+from synthetic import random_scene
+
+
+def planned(scene: Path, **words: object) -> Run[ViewOptions]:
+    """A run that only looks."""
+    return open_run(scene, ViewOptions(cameras=NO_CAMERAS, **words), SILENT, photos=False, decodes=False)  # type: ignore[arg-type]
+
+
+def test_its_steps_show_a_scene_as_it_is(sample_dir: Path, tmp_path: Path) -> None:
+    scene, path = sample_dir / "point_cloud.ply", tmp_path / "fine.fgs"
+    source = planned(scene).source
+    planes = read_all(source, IN_MEMORY)
+    steps = holdable(fine_steps(planes, source.sh_degree), planes)
+    write_grid(path, to_grid(planes, np.full(source.count, source.sh_degree), steps, source.origin)[0], {})
+    found = evaluate(path, scene, cameras=str(sample_dir / "cameras.json"), holdout=16)
+    assert found.quality.fidelity >= 50
+
+
+def test_a_large_scene_has_boxes_and_a_preview(tmp_path: Path) -> None:
+    planes = read_all(random_scene(4096, 0, 1), IN_MEMORY)
+    many = {name: np.tile(values, LEAST_FINE // 4096) for name, values in planes.items()}
+    many["means"] = many["means"] + np.repeat(np.arange(LEAST_FINE // 4096), 4096).astype(np.float32)
+    scene, path = tmp_path / "large.ply", tmp_path / "fine.fgs"
+    write_ply(scene, MemorySource(many))
+    assert write_fine(path, planned(scene), {"start": "kept"})
+    container = GridContainer(path)
+    assert container.header.settings["start"] == "kept" and len(container.header.settings[BOXES]) == 8
+    assert open_fgs(path).count == LEAST_FINE
+    preview = tmp_path / "preview.fgs"
+    preview.write_bytes(container.read_preview())
+    assert open_fgs(preview).count == LEAST_FINE // 64
+    assert not write_fine(path, planned(scene, device="numpy"), {})
+    assert not write_fine(path, planned(scene, memory_limit=300 << 20), {})
+
+
+def test_a_small_scene_is_left_to_version_1(sample_dir: Path, tmp_path: Path) -> None:
+    assert not write_fine(tmp_path / "fine.fgs", planned(sample_dir / "point_cloud.ply"), {})
+    assert list(tmp_path.iterdir()) == []
