@@ -15,11 +15,13 @@ from flexgs_edge.grid.to_grid import lowered, to_grid
 from flexgs_edge.kernels.backend import Backend
 from flexgs_edge.kernels.tested import counted_backend
 from flexgs_edge.memory.storage import IN_MEMORY
+from flexgs_edge.progress import LOG
 from flexgs_edge.run.decoding import coding_device
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.merge import merged
-from flexgs_edge.scene.source import Planes, read_all
+from flexgs_edge.scene.source import GrownSource, Planes, SceneSource, read_all
+from flexgs_edge.units import format_size
 
 LEAST_FINE = FEWEST * CHUNK_ROWS  # Gaussians from which a file tells where its chunks lie
 VALUE_BYTES = 16  # Bytes of memory for each value of a scene: as it is, in order, as a code, and as a symbol
@@ -30,15 +32,21 @@ MOST_MERGED = 1 << 18  # Most Gaussians of a preview: about 3 MB
 def write_fine(path: Path, run: Run[Any], settings: Mapping[str, Any]) -> bool:
     """Write the scene of a run as a file of version 2 with a preview, so that a viewer loads what is in sight first.
 
-    Returns False, and writes nothing, if the scene is small, or without the device or the memory for it.
+    Of a scene that memory does not hold, an even part of the Gaussians is written, drawn larger. Returns False, and writes
+    nothing, if the scene is small, or without the device or the memory for it.
     """
-    source = run.source
-    values = source.count * sum(field.width(source.sh_degree) for field in FIELD.values())
-    if source.count < LEAST_FINE or VALUE_BYTES * values > run.budget.free:
+    source: SceneSource = run.source
+    row_bytes = VALUE_BYTES * sum(field.width(source.sh_degree) for field in FIELD.values())
+    device = _coder(run) if source.count >= LEAST_FINE else None
+    most = run.budget.free // row_bytes
+    if device is None or most < LEAST_FINE:
         return False
-    device = _coder(run)
-    if device is None:
-        return False
+    if source.count > most:
+        enough = format_size(run.budget.limit + (source.count - most) * row_bytes)
+        LOG.warning(
+            "warning: %d of %d Gaussians are shown, larger: --memory-limit %s shows all", most, source.count, enough
+        )
+        source = GrownSource(source.select(np.arange(most) * source.count // most), source.count)
     planes = read_all(source, IN_MEMORY)
     steps = holdable(fine_steps(planes, source.sh_degree), planes)
     grid, order = to_grid(planes, np.full(source.count, source.sh_degree, np.uint8), steps, source.origin)

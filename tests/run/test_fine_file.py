@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from flexgs_edge.codec.open_fgs import open_fgs
 from flexgs_edge.codec.v2.container import BOXES, GridContainer, write_grid
@@ -14,6 +15,7 @@ from flexgs_edge.grid.to_grid import to_grid
 from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.progress import SILENT
+from flexgs_edge.run import fine_file
 from flexgs_edge.run.fine_file import LEAST_FINE, fine_steps, write_fine
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
 from flexgs_edge.run.run import Run, open_run
@@ -51,6 +53,20 @@ def test_a_large_scene_has_boxes_and_a_preview(tmp_path: Path) -> None:
     assert open_fgs(preview).count == LEAST_FINE // 64
     assert not write_fine(path, planned(scene, device="numpy"), {})
     assert not write_fine(path, planned(scene, memory_limit=300 << 20), {})
+
+
+def test_of_what_memory_does_not_hold_a_part_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fine_file, "LEAST_FINE", 1)
+    scene, path = tmp_path / "scene.ply", tmp_path / "fine.fgs"
+    write_ply(scene, random_scene(90_000, 0, 0))
+    run = planned(scene)
+    run.budget.limit = run.budget.used + (200 << 20)
+    monkeypatch.setattr(fine_file, "VALUE_BYTES", 4 * (200 << 20) // 14 // 90_000)
+    assert write_fine(path, run, {})
+    assert 15_000 < open_fgs(path).count <= 22_500
+    assert "of 90000 Gaussians are shown" in caplog.text
 
 
 def test_a_small_scene_is_left_to_version_1(sample_dir: Path, tmp_path: Path) -> None:
