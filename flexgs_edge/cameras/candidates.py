@@ -12,7 +12,7 @@ from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_sh
 from flexgs_edge.cameras.scene_sample import SceneSample
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 
-MOST_VIEWS = 400
+MOST_VIEWS = 1024
 SHOWN = 0.98
 """Views are enough when they show this share of all Gaussians that good views show, all together as well as the best of these."""
 SIDE = 80  # Pixels along the side of a candidate's picture, a square of the same area as the view
@@ -228,7 +228,7 @@ class Stage:
         # The gain of a view only falls, so an older gain is an upper bound. Few views are looked at again for each one.
         bounds = np.where(worth > 0, np.inf, 0.0)
         chosen: list[Candidate] = []
-        at = np.array([view.at for view in self.views]).T
+        at, lines = (np.array([getattr(view, name) for view in self.views]).T for name in ("at", "line"))
         distances = np.array([view.distance for view in self.views])
         new_only = False
         while len(chosen) < (count or MOST_VIEWS) and bounds.any():
@@ -251,7 +251,7 @@ class Stage:
             view = self.views[best]
             chosen.append(view)
             shown[view.rows] += merits[best] / fullest[view.rows]
-            away, turned = at - view.at[:, None], np.array([_along(view.line, other.line) for other in self.views])
+            away, turned = at - view.at[:, None], _along(view.line, lines)
             apart = (away * away).sum(axis=0) / np.maximum(APART * distances, 1e-300) ** 2
             apart += np.maximum(1 - turned, 0.0) * 8
             room *= np.rint(UNITS * (1 - 0.7 * np.exp(-0.5 * np.minimum(apart, 1000.0)))) / UNITS
@@ -272,21 +272,20 @@ class Stage:
             total[view.rows] += share
         between: list[int] = []
         held = np.zeros(total.size)
-        left = [self._worths[id(view)] >= DECIDING for view in chosen]
-        if not any(left):
-            left = [True] * len(chosen)
+        # What a view adds only falls, so what it added before is an upper bound. Below 0: not to be taken.
+        bounds = np.where([self._worths[id(view)] >= DECIDING for view in chosen], np.inf, -1.0)
         while len(between) < -(-len(chosen) // DEFAULT_HOLDOUT):
-            if not any(left):
-                left = [place not in between for place in range(len(chosen))]
-            gains = np.full(len(chosen), -1.0)
-            for place, (view, share) in enumerate(zip(chosen, shares)):
-                if left[place]:
-                    others = total[view.rows] - share
-                    wanted = self.scene.stands[view.rows] * share * others / ((1 + others) * (1 + held[view.rows]))
-                    gains[place] = float(np.rint(1024 * wanted).sum())
-            best = int(np.argmax(gains))
+            if not (bounds >= 0).any():
+                bounds = np.where(np.isin(np.arange(len(chosen)), between), -1.0, np.inf)
+            fresh: set[int] = set()
+            while (best := int(np.argmax(bounds))) not in fresh:
+                view, share = chosen[best], shares[best]
+                others = total[view.rows] - share
+                wanted = self.scene.stands[view.rows] * share * others / ((1 + others) * (1 + held[view.rows]))
+                bounds[best] = float(np.rint(1024 * wanted).sum())
+                fresh.add(best)
             between.append(best)
-            left[best] = False
+            bounds[best] = -1.0
             held[chosen[best].rows] += shares[best]
         last, first = iter(between), iter([turn for turn in range(len(chosen)) if turn not in between])
         return [chosen[next(first if place % DEFAULT_HOLDOUT else last)] for place in range(len(chosen))]

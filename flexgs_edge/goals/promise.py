@@ -172,6 +172,21 @@ class Promised:
         return ", ".join([found, *(part.report(measurement) for part in known)])
 
 
+def by_quality(target: Target, measurement: Measurement) -> tuple[bool, float]:
+    """An order of results of one size, the best first: what breaks no bound that the user set, then what loses least.
+
+    Other bounds follow from what a result itself loses. So a worst view counts as the mean loss that would allow it: a
+    result with one bad view may still be far better than one that loses much everywhere.
+    """
+    broken, loss = False, measurement.loss(target.figure)
+    for part in target.parts if isinstance(target, Promised) else ():
+        found = part.found(measurement)
+        if isinstance(part, WorstView) and found is not None:
+            broken |= part.limit is not None and found > part.limit
+            loss = max(loss, (found - WORST_MORE) / WORST_TIMES)
+    return broken, loss
+
+
 def mean_alone(target: Target) -> Target:
     """The target without the promise. Rough estimates aim by it: a worst view is too noisy, SSIM too slow for them."""
     return target.target if isinstance(target, Promised) else target

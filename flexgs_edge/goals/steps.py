@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from flexgs_edge.errors import InputError, TargetError
-from flexgs_edge.goals.promise import Promised, in_the_way
+from flexgs_edge.goals.promise import by_quality, in_the_way
 from flexgs_edge.goals.target import Measurement, Target
 
 MAX_PRUNE = 980  # Largest prune rate of the refinement, in thousandths; something must be left to draw
@@ -111,18 +111,14 @@ class Point(Protocol):
 def better(step: Point, other: Point, target: Target) -> bool:
     """Whether `step` is the better answer: one that holds, then the smaller file.
 
-    For a size target, of two that hold: the one that keeps the promise, then the lower loss.
+    For a size target, of two that hold: see `by_quality`.
     """
     if step.holds != other.holds:
         return step.holds
     if not step.holds:
         return step.excess < other.excess
     if target.limit_bytes is not None and step.measurement is not None and other.measurement is not None:
-        if isinstance(target, Promised):
-            broken, other_broken = (target.broken(point.measurement) > 0 for point in (step, other))
-            if broken != other_broken:
-                return other_broken
-        return step.measurement.loss(target.figure) < other.measurement.loss(target.figure)
+        return by_quality(target, step.measurement) < by_quality(target, other.measurement)
     return step.size < other.size
 
 

@@ -75,9 +75,9 @@ def test_what_was_not_measured_does_not_decide() -> None:
 
 
 def test_a_size_holds_whatever_the_promise_says() -> None:
-    """Of two files that fit, the one that keeps the promise is better, even if its mean is worse."""
+    """Of two files that fit, one that breaks a bound that was set is worse, whatever its mean."""
     target = Promised(MaxSize(1000, "drop"), PARTS)
-    broken = replace(GOOD, drop=0.7, made_gap=5.0)
+    broken = replace(GOOD, drop=0.7, worst=Measurement(1.8, 30.0, 1.8), made_gap=5.0)
 
     def step(measurement: Measurement) -> Step:
         return Step(Choice(0, 0), 900, measurement, target.excess(900, measurement), "list", 0.0)
@@ -86,6 +86,15 @@ def test_a_size_holds_whatever_the_promise_says() -> None:
     assert not better(step(broken), step(GOOD), target)
     assert better(step(replace(GOOD, drop=0.7)), step(GOOD), target)
     assert in_the_way(target, 900, broken).startswith("the made poses stand")
+    # A bound that follows from the mean says less than the mean: one bad view is better than a loss everywhere.
+    target = Promised(MaxSize(1000, "drop"), (WorstView("drop"), MadePoses()))
+    one, everywhere = (
+        Measurement(mean, 30.0, mean, Measurement(worst, 25.0, worst), usual=mean)
+        for mean, worst in ((2.0, 4.1), (13.6, 15.6))
+    )
+    assert target.broken(one) > 0 > target.broken(everywhere) and better(step(one), step(everywhere), target)
+    slightly = replace(one, drop=1.9, worst=Measurement(7.0, 20.0, 7.0))
+    assert better(step(one), step(slightly), target)
 
 
 def test_with_a_size_the_worst_view_follows_a_mean_where_gains_count_as_nothing() -> None:

@@ -34,7 +34,7 @@ from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_byte
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
 from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, LEVEL_SHARE, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
-from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, Maker, Product, search, search_on
+from flexgs_edge.methods.best.search import Candidate, Maker, Product, search, search_size
 from flexgs_edge.progress import LOG
 from flexgs_edge.quality.view_quality import Quality
 from flexgs_edge.render.renderer import Renderer
@@ -49,7 +49,6 @@ from flexgs_edge.scene.source import MemorySource
 from flexgs_edge.units import format_size
 from flexgs_edge.views.references import Original, References
 
-PLAIN = 2  # Most candidates of a size without a descent
 See = Callable[[Sequence[int], int], bool]
 MakerOf = Callable[[PruneRounds, Measure, See | None], Maker[Product]]
 """Makes the maker of a search from rounds, a measure, and what scores poses beside views that lose too much."""
@@ -219,6 +218,7 @@ def search_best(
     run.budget.require("a search by measured costs", plan.held + plan.least)
     run.budget.take("the scene and its search", plan.held)
     further = 0
+    rounds: PruneRounds | None = None
 
     def measure(planes: dict[str, np.ndarray], estimate: bool = False) -> Measurement:
         with renderer.load(MemorySource(planes, origin=source.origin)) as kept_scene:
@@ -227,6 +227,7 @@ def search_best(
 
     def see(views: Sequence[int], number: int) -> bool:
         nonlocal further
+        assert rounds is not None
         beside = poses.beside([judge.cameras[view] for view in views], renderer, source)
         seen = rounds.see(beside, number, poses.known)
         if seen:
@@ -242,23 +243,23 @@ def search_best(
                 renderer, source.origin, poses.cameras, references, between, run.progress, plan.steps, turns, depth
             )
 
-            def rounds_of(original: Original, checkpoint: Checkpoint | None) -> PruneRounds:
-                return PruneRounds(original, source, options.refit, options.unseen_share, checkpoint)
+            def begin(original: Original, checkpoint: Checkpoint | None, see: See | None) -> Maker[Product]:
+                nonlocal rounds
+                rounds = None  # one at a time: they take most of the memory
+                rounds = PruneRounds(original, source, options.refit, options.unseen_share, checkpoint)
+                return make(rounds, measure, see)
 
             def tell(step: Candidate) -> None:
                 LOG.info("%s", step_words(as_step(step, source.count), target))
 
-            plain, tried = None, MOST_TRIED
+            plain = partial(begin, replace(original, steps=0), None, None)
+            fine = partial(begin, original, checkpoint, see if options.makes_poses else None)
             if target.limit_bytes is not None and plan.steps:
-                # Where the size has room for about all rows, pruning for a descent loses more than the descent mends.
-                maker = make(rounds_of(replace(original, steps=0), None), measure, None)
-                plain = search(maker, target, tried=PLAIN, best_effort=True, on_step=tell)
-                tried -= len(plain.steps)
-            rounds = rounds_of(original, checkpoint)
-            takes_closest = options.takes_closest or (plain is not None and plain.reached)
-            maker = make(rounds, measure, see if options.makes_poses else None)
-            later = partial(search, maker, target, tried=tried, best_effort=takes_closest, on_step=tell)
-            found = later() if plain is None else search_on(plain, later, target)
+                found = search_size(plain, fine, target, options.takes_closest, tell)
+            else:
+                found = search(fine(), target, best_effort=options.takes_closest, on_step=tell)
+            assert rounds is not None
+            unseen = rounds.unseen
     finally:
         run.budget.give(plan.held)
     if found.chosen.left_out:
@@ -268,7 +269,7 @@ def search_best(
             found.chosen.left_out,
         )
     steps = tuple(as_step(step, source.count) for step in found.steps)
-    scored = Scored(len(poses.cameras) + further, poses.made + further, rounds.unseen)
+    scored = Scored(len(poses.cameras) + further, poses.made + further, unseen)
     return found.product, SearchResult(steps[found.steps.index(found.chosen)], found.reached, steps, scored)
 
 

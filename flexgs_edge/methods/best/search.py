@@ -8,7 +8,7 @@ it that misses. The best candidate then loses Gaussians until it hardly holds.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from flexgs_edge.errors import TargetError
@@ -21,6 +21,10 @@ NEAREST = 0.1
 """A new point keeps this share of the interval between its neighbours away from both, since curves are not quite smooth."""
 MOST_TRIED = 6
 """Most candidates with those that lost Gaussians; while none holds, and of a size, most candidates."""
+PLAIN = (
+    2,
+    4,
+)  # Most candidates of a size without a descent, before the first one with: if one holds, and while none does
 AIM = -0.01  # Log of the share that we aim at
 SLOPE, SIZE_SLOPE = 0.7, -0.45
 """Slopes of the logs of the share and of the size over that of the multiplier, before two points are measured:
@@ -134,35 +138,51 @@ class RateResult(Generic[Product]):
     interrupted: bool = False  # whether Ctrl-C ended the search
 
 
-def search_on(
-    first: RateResult[Product], later: Callable[[], RateResult[Product]], target: Target
+def search_size(
+    plain: Callable[[], Maker[Product]],  # begins the maker without a descent; it may be called twice
+    fine: Callable[[], Maker[Product]],  # begins the maker with one
+    target: Target,
+    best_effort: bool = False,
+    on_step: Callable[[Candidate], None] | None = None,
 ) -> RateResult[Product]:
-    """The better one of an answer and that of a search after it, with the candidates of both. Ctrl-C ends both searches."""
+    """Search for the best result of a size by two makers: a few candidates of the first, one of the second, then the better's.
+
+    Where the size has room for about all rows, pruning for a descent loses more than the descent mends. Ctrl-C ends both.
+    """
+    first = search(plain(), target, *PLAIN, best_effort=True, on_step=on_step)
     if first.interrupted:
         return first
     try:
-        found = later()
+        maker = fine()
+        found = search(maker, target, tried=1, best_effort=True, on_step=on_step)
+        others, left = first.steps, MOST_TRIED - len(first.steps)
+        if not better(found.chosen, first.chosen, target):
+            del maker
+            maker, others, found, left = plain(), found.steps, first, MOST_TRIED - 1
+            maker.start(target)
+        last = search(maker, target, tried=left, best_effort=best_effort, on_step=on_step, begun=found)
     except KeyboardInterrupt:
-        return first
-    best = found if better(found.chosen, first.chosen, target) else first
-    return RateResult(best.product, best.chosen, best.reached, first.steps + found.steps, found.interrupted)
+        return replace(first, interrupted=True)
+    return replace(last, steps=others + last.steps)
 
 
 def search(
     maker: Maker[Product],  # makes the candidates
     target: Target,  # what must hold
-    most: int = 4,  # most candidates, if one of them holds
-    tried: int = MOST_TRIED,  # most candidates of a size or while none holds, and of all with those that lost Gaussians
+    most: int | None = None,  # most candidates, if one of them holds: by default 4, of a size all that are tried
+    tried: int = MOST_TRIED,  # most candidates while none holds, and of all with those that lost Gaussians
     best_effort: bool = False,  # answer with the closest candidate if none holds
     on_step: Callable[[Candidate], None] | None = None,  # called with each candidate
+    begun: RateResult[Product] | None = None,  # goes on from this result of the same maker, which has started
 ) -> RateResult[Product]:
     """Search for the best candidate. An interrupted search answers with the best one so far.
 
     Raises `TargetError` when no candidate holds and `best_effort` is not set; it names the closest one.
     """
-    steps: tuple[Candidate, ...] = ()
-    best: tuple[Candidate, Product] | None = None
+    steps: tuple[Candidate, ...] = () if begun is None else begun.steps
+    best = None if begun is None else (begun.chosen, begun.product)
     by_size, interrupted = target.limit_bytes is not None, False
+    most = most or (tried if by_size else 4)
 
     def tell(step: Candidate) -> None:
         nonlocal steps
@@ -170,7 +190,17 @@ def search(
         if on_step:
             on_step(step)
 
-    place: float | None = _aimed(maker, math.log(maker.start(target)), target)
+    def ends() -> bool:
+        assert best is not None
+        # A size is close enough within .3 %.
+        close = best[0].holds and best[0].excess > -(0.003 if by_size else maker.close)
+        return close or len(steps) >= (most if best[0].holds else tried)
+
+    place: float | None = None
+    if begun is None:
+        place = _aimed(maker, math.log(maker.start(target)), target)
+    elif not ends():
+        place = next_place(steps, target)
     try:
         while place is not None:
             step, product = maker.make(math.exp(place), target)
@@ -181,9 +211,7 @@ def search(
                     maker.discard(dropped[1])
             else:
                 maker.discard(product)
-            # A size is close enough within .3 %.
-            close = best[0].holds and best[0].excess > -(0.003 if by_size else maker.close)
-            if close or len(steps) >= (most if best[0].holds and not by_size else tried):
+            if ends():
                 break
             lost = [] if best[0].holds else lost_views(target, step.measurement)
             seen = bool(lost) and maker.see(lost)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from flexgs_edge.errors import TargetError
 from flexgs_edge.goals.promise import Promised, WorstView
 from flexgs_edge.goals.target import MaxDrop, MaxSize, Measurement, MinFidelity, Target
-from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, next_place, search, search_on
+from flexgs_edge.methods.best.search import MOST_TRIED, Candidate, next_place, search, search_size
 from known_maker import AT, BYTES, World, powers
 
 
@@ -131,12 +130,45 @@ def test_an_interrupted_search_takes_the_best_so_far() -> None:
     world.made = [1.0]
     with pytest.raises(KeyboardInterrupt):
         search(world, MaxDrop(1.0))
-    # A search that is followed by another ends both, and keeps its answer where the other has none.
-    assert search_on(first, lambda: pytest.fail("no more"), MaxDrop(1.0)) is first
-    whole = replace(first, interrupted=False)
-    assert search_on(whole, lambda: search(world, MaxDrop(1.0)), MaxDrop(1.0)) is whole
-    both = search_on(whole, lambda: first, MaxDrop(1.0))
-    assert both.interrupted and both.steps == first.steps * 2 and both.chosen is first.chosen
+
+
+def size_world(loss: float, at: float = AT) -> World:
+    """Loses `loss` dB at the size that is asked for, and less in a larger file."""
+    return World(lambda m: loss * (m / at) ** 0.7, lambda m: BYTES * (m / at) ** -0.45, start=1.5 * at)
+
+
+@pytest.mark.parametrize("plain_loss", [0.5, 2.0])
+def test_of_a_size_the_better_maker_goes_on(plain_loss: float) -> None:
+    """The other one gets a single candidate with a descent, or a few without."""
+    made: list[World] = []
+    steps: list[Candidate] = []
+
+    def begin(loss: float) -> World:
+        made.append(size_world(loss))
+        return made[-1]
+
+    target = MaxSize(BYTES, "drop")
+    found = search_size(lambda: begin(plain_loss), lambda: begin(1.0), target, on_step=steps.append)
+    assert (found.reached and list(found.steps) in (steps, [*steps[-1:], *steps[:-1]])) or len(found.steps) == len(
+        steps
+    )
+    assert len(found.steps) <= MOST_TRIED and found.chosen.measurement.drop == pytest.approx(
+        min(plain_loss, 1.0), rel=0.05
+    )
+    assert len(made[1].made) == (1 if plain_loss < 1.0 else len(found.steps) - len(made[0].made))
+    assert len(made) == (3 if plain_loss < 1.0 else 2)
+
+
+def test_ctrl_c_ends_both_searches_of_a_size() -> None:
+    class Interrupted(World):
+        def make(self, multiplier: float, target: Target) -> Any:
+            raise KeyboardInterrupt
+
+    target, whole = MaxSize(BYTES, "drop"), size_world(1.0)
+    found = search_size(lambda: whole, lambda: Interrupted(whole.loss, whole.size), target)
+    assert found.interrupted and found.reached and len(whole.made) == len(found.steps)
+    with pytest.raises(KeyboardInterrupt):
+        search_size(lambda: Interrupted(whole.loss, whole.size), lambda: pytest.fail("no more"), target)
 
 
 def test_a_miss_is_followed_by_a_smaller_multiplier_with_some_room() -> None:
