@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 from flexgs_edge.errors import TargetError
-from flexgs_edge.goals.promise import lost_views
+from flexgs_edge.goals.promise import by_quality, lost_views
 from flexgs_edge.goals.steps import better, obstacle
 from flexgs_edge.goals.target import Measurement, Target
 from flexgs_edge.progress import LOG
@@ -154,16 +154,21 @@ def search_size(
         return first
     try:
         maker = fine()
-        found = search(maker, target, tried=1, best_effort=True, on_step=on_step)
-        others, left = first.steps, MOST_TRIED - len(first.steps)
-        if not better(found.chosen, first.chosen, target):
+        found, other = search(maker, target, tried=1, best_effort=True, on_step=on_step), first
+        # Whatever fits: a miss is landed later. What a result loses tells which kind is better.
+        one, two = (by_quality(target, result.chosen.measurement) for result in (found, first))
+        if one >= two:
             del maker
-            maker, others, found, left = plain(), found.steps, first, MOST_TRIED - 1
-            maker.start(target)
-        last = search(maker, target, tried=left, best_effort=best_effort, on_step=on_step, begun=found)
+            maker, found, other = plain(), first, found
+            maker.probe(maker.start(target), target)  # as the search before began: step sizes depend on what stays then
+        tried = MOST_TRIED - len(other.steps)
+        last = search(maker, target, tried=tried, best_effort=True, on_step=on_step, begun=found)
     except KeyboardInterrupt:
         return replace(first, interrupted=True)
-    return replace(last, steps=others + last.steps)
+    best = last if better(last.chosen, other.chosen, target) else other
+    if not best.reached and not best_effort:
+        raise missed(target, best.chosen)
+    return replace(best, steps=other.steps + last.steps, interrupted=last.interrupted)
 
 
 def search(
@@ -227,12 +232,17 @@ def search(
     assert best is not None
     chosen, product = best
     if not chosen.holds and not best_effort:
-        last = ", with one Gaussian left" if by_size and chosen.count == 1 else ""
-        raise TargetError(
-            f"{target.describe()} is out of reach; the closest point has {target.report(chosen.size, chosen.measurement)}"
-            f"{last} (--best-effort writes it){obstacle(target, chosen)}"
-        )
+        raise missed(target, chosen)
     return RateResult(product, chosen, chosen.holds, steps, interrupted)
+
+
+def missed(target: Target, closest: Candidate) -> TargetError:
+    """The error to raise if no candidate holds."""
+    last = ", with one Gaussian left" if target.limit_bytes is not None and closest.count == 1 else ""
+    return TargetError(
+        f"{target.describe()} is out of reach; the closest point has {target.report(closest.size, closest.measurement)}"
+        f"{last} (--best-effort writes it){obstacle(target, closest)}"
+    )
 
 
 def _aimed(maker: Maker[Product], place: float, target: Target) -> float:
