@@ -19,14 +19,13 @@ from flexgs_edge.progress import LOG
 from flexgs_edge.run.decoding import coding_device
 from flexgs_edge.run.run import Run
 from flexgs_edge.scene.fields import FIELD
-from flexgs_edge.scene.merge import merged
-from flexgs_edge.scene.source import GrownSource, Planes, SceneSource, read_all
+from flexgs_edge.scene.source import GrownSource, Planes, SceneSource, growth, read_all
 from flexgs_edge.units import format_size
 
 LEAST_FINE = FEWEST * CHUNK_ROWS  # Gaussians from which a file tells where its chunks lie
 VALUE_BYTES = 16  # Bytes of memory for each value of a scene: as it is, in order, as a code, and as a symbol
-MERGED = 64  # Neighbours that one Gaussian of the preview stands for
-MOST_MERGED = 1 << 18  # Most Gaussians of a preview: about 3 MB
+NEIGHBOURS = 32  # One Gaussian of the preview stands for so many of the scene
+MOST_PREVIEWED = 1 << 18  # Most Gaussians of a preview: about 3 MB
 
 
 def write_fine(path: Path, run: Run[Any], settings: Mapping[str, Any]) -> bool:
@@ -50,7 +49,7 @@ def write_fine(path: Path, run: Run[Any], settings: Mapping[str, Any]) -> bool:
     planes = read_all(source, IN_MEMORY)
     steps = holdable(fine_steps(planes, source.sh_degree), planes)
     grid, order = to_grid(planes, np.full(source.count, source.sh_degree, np.uint8), steps, source.origin)
-    few = merged(planes, order, max(MERGED, -(-source.count // MOST_MERGED)))
+    few = heaviest(planes, order, max(NEIGHBOURS, -(-source.count // MOST_PREVIEWED)))
     del planes, order
     small, _ = to_grid(few, np.zeros(few["means"].shape[1], np.uint8), holdable(steps, few), source.origin)
     preview = path.with_name("preview.fgs")
@@ -63,6 +62,17 @@ def fine_steps(planes: Planes, sh_degree: int) -> StepSizes:
     """Step sizes by which a scene looks as it is: about 50 dB."""
     width = float(np.exp(np.median(planes["log_scales"].min(axis=0))))
     return StepSizes(position=width / 8, scale=0.03, rotation=0.005, opacity=0.05, dc=0.008, sh=(0.01,) * sh_degree)
+
+
+def heaviest(planes: Planes, order: np.ndarray, size: int) -> Planes:
+    """Of each `size` rows that follow each other in `order` ([n] i64), the one that holds back most light, larger, without SH."""
+    groups = order[: len(order) // size * size].reshape(-1, size)
+    longest = planes["log_scales"].sum(axis=0) - planes["log_scales"].min(axis=0)
+    light = (longest - np.logaddexp(0, -planes["opacity_logits"][0]))[groups]
+    kept = np.sort(np.take_along_axis(groups, light.argmax(axis=1)[:, None], axis=1)[:, 0])
+    few = {name: values[:, kept] for name, values in planes.items()}
+    few["sh_rest"], few["log_scales"] = few["sh_rest"][:0], few["log_scales"] + growth(len(kept), len(order))
+    return few
 
 
 def _coder(run: Run[Any]) -> Backend | None:

@@ -16,10 +16,10 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.memory.storage import IN_MEMORY
 from flexgs_edge.progress import SILENT
 from flexgs_edge.run import fine_file
-from flexgs_edge.run.fine_file import LEAST_FINE, fine_steps, write_fine
+from flexgs_edge.run.fine_file import LEAST_FINE, NEIGHBOURS, fine_steps, heaviest, write_fine
 from flexgs_edge.run.options import NO_CAMERAS, ViewOptions
 from flexgs_edge.run.run import Run, open_run
-from flexgs_edge.scene.source import MemorySource, read_all
+from flexgs_edge.scene.source import MemorySource, growth, read_all
 from synthetic import random_scene
 
 
@@ -50,7 +50,7 @@ def test_a_large_scene_has_boxes_and_a_preview(tmp_path: Path) -> None:
     assert open_fgs(path).count == LEAST_FINE
     preview = tmp_path / "preview.fgs"
     preview.write_bytes(container.read_preview())
-    assert open_fgs(preview).count == LEAST_FINE // 64
+    assert open_fgs(preview).count == LEAST_FINE // NEIGHBOURS
     assert not write_fine(path, planned(scene, device="numpy"), {})
     assert not write_fine(path, planned(scene, memory_limit=300 << 20), {})
 
@@ -67,6 +67,17 @@ def test_of_what_memory_does_not_hold_a_part_is_shown(
     assert write_fine(path, run, {})
     assert 15_000 < open_fgs(path).count <= 22_500
     assert "of 90000 Gaussians are shown" in caplog.text
+
+
+def test_the_preview_has_what_holds_back_most_light() -> None:
+    planes = read_all(random_scene(7, 0, 1), IN_MEMORY)
+    planes["log_scales"][:] = [[-5, -5, -2, -3, -4, -4, 9], [-5, -1, -2, -3, -4, -4, 9], [-5, -9, -2, -3, -4, -4, 9]]
+    planes["opacity_logits"][:] = [[9, 9, -9, 1, 9, 9, 9]]
+    few = heaviest(planes, np.array([4, 0, 2, 5, 1, 3, 6]), 3)
+    rows = [1, 4]  # -6 of -8, -6 and -6.3; -8 of -8, -10 and -13
+    np.testing.assert_array_equal(few["means"], planes["means"][:, rows])
+    np.testing.assert_array_equal(few["log_scales"], planes["log_scales"][:, rows] + growth(2, 7))
+    assert few["sh_rest"].shape == (0, 2)
 
 
 def test_a_small_scene_is_left_to_version_1(sample_dir: Path, tmp_path: Path) -> None:
