@@ -10,8 +10,8 @@ import pytest
 
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.constants import SH_C0
-from flexgs_edge.grid.step_sizes import StepSizes
-from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps, holdable, probe_slopes, reachable
+from flexgs_edge.grid.step_sizes import StepSizes, holdable
+from flexgs_edge.methods.best.choose_steps import GEOMETRY, Slopes, choose_steps, probe_slopes, reachable
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.scene.fields import FIELD
 from flexgs_edge.scene.source import MemorySource
