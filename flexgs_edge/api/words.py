@@ -76,7 +76,6 @@ class CompressWords(TypedDict, total=False):
     force_lossy: bool
     layers: int | None
     preview: int | None
-    levels: bool
     scratch: str | None
     resume: bool
     report: str | None

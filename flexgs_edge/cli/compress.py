@@ -153,12 +153,6 @@ Several scenes:
     help="Most bytes of a small scene that viewers show at once; 0: none. Default: 2 % of a file of "
     "1 MB or more, if at most 262144 Gaussians or three fifths of the scene are left.",
 )
-@option(
-    OUTPUT,
-    "--levels",
-    is_flag=True,
-    help="Coarser versions of every part, for viewers: for what is far away, or has no room. At most a tenth more bytes.",
-)
 @shared_options.report_option
 @option(OUTPUT, "--dry-run", is_flag=True, help="Write nothing (no -o needed). The size shown is exact.")
 @option(

@@ -17,8 +17,8 @@ import numpy as np
 from flexgs_edge.cameras.json_values import Entry, kind, load_json
 from flexgs_edge.cameras.start import START, StartView
 from flexgs_edge.codec.open_fgs import file_version, read_header
-from flexgs_edge.codec.v1.container import write_container
-from flexgs_edge.codec.v2.container import BOXES, GridContainer, Preview
+from flexgs_edge.codec.v1.container import Header, write_container
+from flexgs_edge.codec.v2.container import BOXES
 from flexgs_edge.codec.v2.header import GridHeader
 from flexgs_edge.errors import BudgetError, DeviceError, FormatError, InputError, brief
 from flexgs_edge.files import atomic_folder, atomic_write, check_folder, check_writable
@@ -36,7 +36,7 @@ from flexgs_edge.run.reporter import encode
 from flexgs_edge.run.run import Run, open_run
 from flexgs_edge.run.view_set import ViewSet
 from flexgs_edge.units import format_size
-from flexgs_edge.viewer.assets import CROP, LEVELLED, PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
+from flexgs_edge.viewer.assets import CROP, PAGE, PLAIN, PREVIEWED, SPATIAL, web_files
 from flexgs_edge.viewer.scene_page import COMMAND, page_config, site_files, viewer_page
 from flexgs_edge.viewer.server import Resource, SceneServer
 
@@ -95,7 +95,7 @@ def view(
     look = {"near": run.options.near, "background": run.options.background, "antialiased": run.options.antialiased}
     name = Path(os.fspath(input)).resolve().name
     with _coded(run, input) as scene:
-        kind = _kind(scene)
+        kind = _kind(read_header(scene))
         files = web_files(file_version(scene), kind, bool(texts))
         size = os.stat(scene).st_size
         if one_file and output is not None:
@@ -164,13 +164,11 @@ def _poster(run: Run[ViewOptions], start: StartView | None) -> bytes | None:
     return encode(picture, POSTER_SIZE, POSTER_QUALITY, short=True)
 
 
-def _kind(scene: Path) -> str:
+def _kind(header: Header | GridHeader) -> str:
     """The kind of scene that a page shows."""
-    header = read_header(scene)
-    previewed = isinstance(header, GridHeader) and bool(header.preview_bytes)
-    if BOXES not in header.settings:
-        return PREVIEWED if previewed else PLAIN
-    return LEVELLED if previewed and Preview(GridContainer(scene)).header.preview_bytes else SPATIAL
+    if BOXES in header.settings:
+        return SPATIAL
+    return PREVIEWED if isinstance(header, GridHeader) and header.preview_bytes else PLAIN
 
 
 def _open(address: str) -> None:

@@ -60,7 +60,6 @@ METHOD_ONLY: dict[str, tuple[str, object]] = {
     "distil": ("best", None),
     "layers": ("best", None),
     "preview": ("best", None),
-    "levels": ("best", False),
     "scratch": ("best", None),
     "resume": ("best", False),
 }  # Options that only one `--method` knows: the method and the default of each
@@ -193,7 +192,6 @@ class CompressOptions(ViewOptions):
     force_lossy: bool = False
     layers: int | None = None
     preview: int | None = None
-    levels: bool = False
     scratch: str | None = None
     resume: bool = False
     report: str | None = None
@@ -231,10 +229,6 @@ class CompressOptions(ViewOptions):
             raise InputError(f"--layers {self.layers}: expected 1 to {LAYERS_MOST}")
         if self.preview is not None and not 0 <= self.preview <= PREVIEW_MOST:
             raise InputError(f"--preview {self.preview}: expected 0 (none) to {PREVIEW_MOST} bytes")
-        if self.levels and self.layers not in (None, 1):
-            raise InputError(
-                f"--levels with --layers {self.layers}: levels replace each other, layers add up; give one or the other"
-            )
         if self.keep_removed is not None and self.clean is None:
             raise InputError(
                 "--keep-removed: nothing is removed without --clean: give it too, or leave --keep-removed out"

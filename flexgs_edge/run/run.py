@@ -387,8 +387,6 @@ def _foreign_format(output: str | os.PathLike[str] | None, options: CompressOpti
         raise InputError(f"--method paper writes .fgs files alone, not {format.suffix}; leave it out, or write a .fgs")
     if options.layers is not None and options.layers > 1:
         raise InputError(f"--layers {options.layers}: {format.suffix} has no layers; leave it out, or write a .fgs")
-    if options.levels:
-        raise InputError(f"--levels: {format.suffix} has no levels; leave it out, or write a .fgs")
     if options.preview:
         raise InputError(f"--preview {options.preview}: {format.suffix} has no preview; leave it out, or write a .fgs")
     if options.resume or options.scratch is not None:

@@ -12,17 +12,15 @@ most of them."""
 _PLAIN_WORKER = "viewer/src/plain-worker.js"
 LIVE = {**ENTRIES, "page": "viewer/src/live.js", "load": _PLAIN_WORKER}  # The same for the live scenes of a report
 ELEMENT = {**ENTRIES, "page": "viewer/src/element.js"}  # The same for the element that other pages hold
-PLAIN, SPATIAL, PREVIEWED, LEVELLED = "plain", "spatial", "previewed", "levelled"
-"""Kinds of scenes: all others, those whose file tells where its chunks lie, those with a preview, and those with levels. Of a
-spatial one, the viewer asks for the chunks in sight first. The viewer of spatial scenes draws the others too."""
+PLAIN, SPATIAL, PREVIEWED = "plain", "spatial", "previewed"
+"""Kinds of scenes: all others, those whose file tells where its chunks lie, and those with a preview. Of a spatial one, the
+viewer asks for the chunks in sight first. The viewer of spatial scenes draws the others too; theirs are shorter."""
 _KINDS = {
     PLAIN: (_PLAIN_WORKER, "viewer/src/scene-viewer-plain.js"),
     SPATIAL: ("viewer/src/load-worker.js", "viewer/src/scene-viewer.js"),
     PREVIEWED: ("viewer/src/preview-worker.js", "viewer/src/scene-viewer-preview.js"),
-    LEVELLED: ("viewer/src/levels-worker.js", "viewer/src/scene-viewer-levels.js"),
 }  # Of each kind, the worker that loads, and the module with the viewer
 _WORKERS, _OWN_WORKERS = "viewer/src/workers.js", "viewer/src/own-workers.js"
-_LEVELS_SORT = "viewer/src/levels-sort-worker.js"
 _NOTES, _NO_NOTES = "viewer/src/notes.js", "viewer/src/no-notes.js"
 CROP = tuple(f"viewer/src/{name}.js" for name in ("crop", "in-picture", "styled", "vectors"))
 """The module that a page loads when somebody opens what lies under "More", and those that it imports."""
@@ -43,7 +41,7 @@ def web_folder() -> Path:
 
 def entries_of(kind: str) -> dict[str, str]:
     """`ENTRIES` for a kind of scene."""
-    return {**ENTRIES, "load": _KINDS[kind][0], "sort": _LEVELS_SORT if kind == LEVELLED else ENTRIES["sort"]}
+    return {**ENTRIES, "load": _KINDS[kind][0]}
 
 
 def web_files(version: int = 1, kind: str = PLAIN, notes: bool = False) -> dict[str, str]:

@@ -50,26 +50,15 @@ def sample_grid(sample_dir: Path, thinned: int) -> GridScene:
 def previewed(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path]:
     """The same scene behind a preview of every eighth row without SH, and that preview."""
     grid = grid_of(scene)
-    flat = _flat(grid, 8)
+    some = grid.take(np.arange(0, grid.count, 8))
+    nothing = np.zeros_like(some.sh_degrees)
+    steps = replace(some.step_sizes, sh=())
+    flat = replace(some, sh_degree=0, sh_degrees=nothing, sh=(), step_sizes=steps, layer=nothing)
     order = np.argsort(_cells_of_one_layer(flat), kind="stable")
     small, place = folder / "small.fgs", folder / "still_life.fgs"
     write_grid(small, flat.take(order), {})
     write_grid(place, grid, {}, chunk_rows=chunk_rows, preview=small.read_bytes())
     return place, small
-
-
-def levelled(scene: Path, folder: Path, chunk_rows: int) -> tuple[Path, Path, Path]:
-    """The same scene in one layer with levels of every fourth and every sixteenth row, and the files of these levels."""
-    grid = one_layer(grid_of(scene))
-    chunks = (np.arange(grid.count) // chunk_rows).astype(np.uint8)
-    places, preview = [folder / f"{name}.fgs" for name in ("coarse", "level", "levelled")], b""
-    for place, thinned in zip(places, (16, 4), strict=False):
-        flat = replace(_flat(grid, thinned), layer=chunks[::thinned])
-        order = np.lexsort((_cells_of_one_layer(flat), flat.layer))
-        write_grid(place, flat.take(order), {}, preview=preview, boxes=False)
-        preview = place.read_bytes()
-    write_grid(places[-1], grid, {}, chunk_rows=chunk_rows, preview=preview)
-    return places[2], places[1], places[0]
 
 
 def one_layer(grid: GridScene) -> GridScene:
@@ -83,14 +72,6 @@ def grid_of(scene: Path) -> GridScene:
     source = open_fgs(scene)
     assert isinstance(source, GridSource)
     return source.grid()
-
-
-def _flat(grid: GridScene, thinned: int) -> GridScene:
-    """One in `thinned` rows, without SH, in one layer."""
-    some = grid.take(np.arange(0, grid.count, thinned))
-    nothing = np.zeros_like(some.sh_degrees)
-    steps = replace(some.step_sizes, sh=())
-    return replace(some, sh_degree=0, sh_degrees=nothing, sh=(), step_sizes=steps, layer=nothing)
 
 
 def _cells_of_one_layer(grid: GridScene) -> np.ndarray:

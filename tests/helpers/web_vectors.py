@@ -133,8 +133,6 @@ KINDS: dict[str, tuple[Callable[[], GridScene], int]] = {
 
 PREVIEWED = "a preview before chunks of 256 rows"
 """A further file; its preview is that of 255 rows."""
-LEVELLED = "levels"
-"""One of 40 rows in four chunks. Its preview has 16 rows in four layers, and a preview of 4 rows."""
 
 PACKED: dict[str, tuple[int, int, BitSpec, int | None]] = {
     "version 1, no SH": (9, 0, BitSpec(xyz=16, dc=1, scale=5, rot=11, opacity=3, rest=2), None),
@@ -155,17 +153,6 @@ def write_all(folder: Path) -> dict[str, Path]:
     files[PREVIEWED] = folder / _file_name(PREVIEWED)
     small = files["255 rows"].read_bytes()
     write_grid(files[PREVIEWED], random_grid(600, 1, 7, layers=2), SETTINGS, chunk_rows=256, preview=small, force=True)
-    files[LEVELLED], levels = folder / _file_name(LEVELLED), b""
-    for rows, layers, chunk_rows in ((4, 2, 4), (16, 4, 16), (40, 1, 10)):
-        write_grid(
-            files[LEVELLED],
-            random_grid(rows, 0, 5, layers=layers),
-            SETTINGS,
-            chunk_rows=chunk_rows,
-            preview=levels,
-            force=True,
-        )
-        levels = files[LEVELLED].read_bytes()
     for name, (rows, degree, bits, groups) in PACKED.items():
         files[name] = folder / _file_name(name)
         scene = quantize_all(make_scene(rows, degree), bits, groups)

@@ -30,7 +30,7 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.run import run as run_module
 from flexgs_edge.run.options import ViewOptions
 from flexgs_edge.run.run import open_run
-from flexgs_edge.viewer.assets import ELEMENT, LEVELLED, PLAIN, PREVIEWED, SPATIAL, entries_of, web_files
+from flexgs_edge.viewer.assets import ELEMENT, PLAIN, PREVIEWED, SPATIAL, entries_of, web_files
 from flexgs_edge.viewer.join import join_modules
 from flexgs_edge.viewer.scene_page import page_config, viewer_page
 from grid_scenes import make_grid
@@ -47,13 +47,7 @@ CAMERA = {
     "fy": 40,
 }
 
-MOST_SENT = {
-    (1, PLAIN): 29_500,
-    (2, PLAIN): 26_300,
-    (2, PREVIEWED): 27_300,
-    (2, SPATIAL): 30_000,
-    (2, LEVELLED): 31_000,
-}
+MOST_SENT = {(1, PLAIN): 29_500, (2, PLAIN): 26_300, (2, PREVIEWED): 27_300, (2, SPATIAL): 30_000}
 """Bytes of viewer and decoder with gzip, by the version and the kind of the scene."""
 
 

@@ -137,7 +137,7 @@ def trim_container(
 ) -> int:
     """Copy as many whole layers as fit into `max_size` bytes, with the preview; return the bytes of the new file.
 
-    If not even the first layer fits, the new file is the preview, or the preview's preview.
+    If not even the first layer fits, the new file is the preview.
 
     Raises `TargetError` if nothing fits.
     """
@@ -155,12 +155,10 @@ def trim_container(
         if size <= max_size:
             break
     else:
-        while container.header.preview.length:
-            container = Preview(container)
-            if container.size <= max_size:
-                with atomic_write(path, force) as file:
-                    return file.write(container.data)
-        raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
+        if not 0 < container.header.preview.length <= max_size:
+            raise TargetError(f"{source}: its first layer needs {size} bytes, {max_size} are allowed")
+        with atomic_write(path, force) as file:
+            return file.write(Preview(container).data)
     with container.open() as old, atomic_write(path, force) as file:
         file.seek(PREAMBLE_BYTES)
         file.write(encode_header(header))
@@ -304,7 +302,7 @@ class GridContainer(SectionFile):
 
 
 class Preview(GridContainer):
-    """The preview of a file, which is held in memory: a file of its own, perhaps with a preview.
+    """The preview of a file, which is held in memory: a file of its own.
 
     `whole`: the file. Raises `FormatError` if anything differs from the format. Bytes count from where the preview
     begins.
@@ -313,8 +311,8 @@ class Preview(GridContainer):
     def __init__(self, whole: GridContainer) -> None:
         self.data = whole.read_preview()
         super().__init__(f"{whole.path} (preview)")
-        if isinstance(whole, Preview) and self.header.preview_bytes is not None:
-            raise self._error(PREAMBLE_BYTES, "header: preview_bytes: wanted none here")
+        if self.header.preview_bytes is not None:
+            raise self._error(PREAMBLE_BYTES, "header: preview_bytes: wanted none in a preview")
         own, others = self.header, whole.header
         if own.origin != others.origin:
             raise self._error(PREAMBLE_BYTES, f"header: origin: wanted {others.origin}, got {own.origin}")
@@ -331,8 +329,6 @@ class Preview(GridContainer):
     def verify(self) -> None:
         """Check every byte; raises `FormatError`."""
         self.read_model()
-        if self.header.preview.length:
-            Preview(self).verify()
         for entry in self.read_table():
             self.check_chunk(entry)
 

@@ -8,17 +8,13 @@ import numpy as np
 
 from flexgs_edge.codec.v2.container import coded_size, write_grid
 from flexgs_edge.codec.v2.encode import Encoded, encode_grid
-from flexgs_edge.codec.v2.header import CHUNK_ROWS, PREVIEW_KEY
+from flexgs_edge.codec.v2.header import PREVIEW_KEY
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.methods.best.allocation import BitModel
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
 from flexgs_edge.run.options import CompressOptions
-
-LEVELS_COST = 1.1  # Most bytes of a file with levels over those of one without
-LEVEL_CHUNKS, LEAST_CHUNK_ROWS = 128, 4096
-"""A file with levels has so many chunks at most, of at least so many rows; a large scene has more of the usual ones."""
 
 
 def projected_size(options: CompressOptions, size: int) -> int:
@@ -27,7 +23,7 @@ def projected_size(options: CompressOptions, size: int) -> int:
     A preview by default comes only where it fits. Layers cost at most 6 %, since neighbours on the curve are farther apart in a
     layered file: docs/results/tuning.md#layers_cost
     """
-    cost = LEVELS_COST if options.levels else 1.0 if options.layers in (None, 1) else 1.06
+    cost = 1.0 if options.layers in (None, 1) else 1.06
     return round(cost * size) + with_preview(options.preview or 0)
 
 
@@ -36,31 +32,21 @@ def with_preview(size: int) -> int:
     return size + PREVIEW_KEY if size else 0
 
 
-def level_chunk_rows(count: int) -> int:
-    """Rows of a chunk in a file with levels, of a scene of `count` rows."""
-    wanted = max(-(-count // LEVEL_CHUNKS), LEAST_CHUNK_ROWS)
-    return min(1 << (wanted - 1).bit_length(), CHUNK_ROWS)
-
-
 class GridCoder:
     """Codes grids. The last one stays coded, so that writing it only copies bytes.
 
     `renderer`: its device codes if it can. `settings_room`: most bytes of the settings in the header. The search counts
-    them before they are known. `levels`: whether files have them; their chunks are smaller.
+    them before they are known.
     """
 
-    def __init__(self, renderer: Renderer, settings_room: int, levels: bool = False) -> None:
-        self._renderer, self._settings_room, self._levels = renderer, settings_room, levels
+    def __init__(self, renderer: Renderer, settings_room: int) -> None:
+        self._renderer, self._settings_room = renderer, settings_room
         self._last: tuple[GridScene, Encoded] | None = None
 
     def _encode(self, grid: GridScene) -> Encoded:
         self._trim()
         device = coding_device(self._renderer.backend, self._renderer.budget, grid.count, grid.sh_degree)
-        return encode_grid(grid, self.chunk_rows(grid), device, self._renderer.storage)
-
-    def chunk_rows(self, grid: GridScene) -> int:
-        """Rows of a chunk of a grid."""
-        return level_chunk_rows(grid.count) if self._levels else CHUNK_ROWS
+        return encode_grid(grid, device=device, storage=self._renderer.storage)
 
     def encoded(self, grid: GridScene) -> Encoded:
         """The coded grid."""
@@ -80,7 +66,7 @@ class GridCoder:
         """Bytes of the file that `write` makes. A search does not know the `settings` yet: without them it is an upper bound."""
         encoded = self.encoded(grid)
         self._trim()
-        size = coded_size(grid, settings or {}, self.chunk_rows(grid), encoded=encoded, preview=preview)
+        size = coded_size(grid, settings or {}, encoded=encoded, preview=preview)
         return size + self._settings_room if settings is None else size
 
     def write(
@@ -89,7 +75,7 @@ class GridCoder:
         """See `write_grid`."""
         encoded = self.encoded(grid)
         self._trim()
-        return write_grid(path, grid, settings, chunk_rows=self.chunk_rows(grid), encoded=encoded, preview=preview)
+        return write_grid(path, grid, settings, encoded=encoded, preview=preview)
 
     def _trim(self) -> None:
         """Return the holes that drawing and counting left in the heap, where memory is short."""

@@ -16,8 +16,6 @@ import numpy as np
 from flexgs_edge.cameras.camera import Camera
 from flexgs_edge.cameras.generated import poses_between
 from flexgs_edge.codec.open_fgs import open_fgs
-from flexgs_edge.codec.v2.container import FEWEST
-from flexgs_edge.codec.v2.header import LAYERS_MOST, PREVIEW_MOST
 from flexgs_edge.errors import TargetError
 from flexgs_edge.files import temporary_name
 from flexgs_edge.goals.steps import Choice, Scored, SearchResult, Step, step_words
@@ -32,7 +30,7 @@ from flexgs_edge.methods.best.layers import assign_layers, can_sort
 from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
-from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, LEVEL_SHARE, PREVIEW_SHARE, make_preview
+from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, search, search_size
 from flexgs_edge.progress import LOG
@@ -72,7 +70,7 @@ def compress(run: Run[CompressOptions], renderer: Renderer | None) -> MethodResu
             with run.clock.stage("fingerprint"):
                 kept = open_checkpoint(run, renderer, poses.cameras, folder)
         LOG.info("searching for %s", run.target.describe())
-        coder = GridCoder(renderer, settings_room(run), run.options.levels)
+        coder = GridCoder(renderer, settings_room(run))
         maker = grid_maker(run, coder)
         grid, search = search_best(maker, run, renderer, poses, judges.decide, checkpoint=kept)
         judges.decided()
@@ -125,27 +123,15 @@ def _preview(
 ) -> bytes:
     """The preview that was asked for, or the one that a large file has by default."""
     most, limit, size = run.options.preview, run.target.limit_bytes, coder.size(grid, settings)
-    if run.options.levels:
-        most = most or int(PREVIEW_SHARE * size)
-    elif most is None:
+    if most is None:
         large = size >= LEAST_PREVIEWED and can_sort(grid.count, run.source.count)
         most = int(PREVIEW_SHARE * size) if large else 0
         if limit is not None and size + with_preview(most) > limit:
             return b""
     if not most:
         return b""
-    sizes, chunk_rows = [most], None
-    if run.options.levels:
-        chunk_rows = coder.chunk_rows(grid)
-        chunks = -(-grid.count // chunk_rows)
-        if not FEWEST <= chunks <= LAYERS_MOST:
-            LOG.warning("no levels: the file has %d chunks, levels need %d to %d", chunks, FEWEST, LAYERS_MOST)
-            chunk_rows = None
-        else:
-            sizes = [min(int(LEVEL_SHARE * size), PREVIEW_MOST - with_preview(most)), most]
     with run.clock.stage("preview"):
-        bits = coder.bits(grid)
-        preview = make_preview(grid, sizes, bits, renderer, cameras, settings, run.progress, chunk_rows)
+        preview = make_preview(grid, most, coder.bits(grid), renderer, cameras, settings, run.progress)
     if preview:
         LOG.info("a preview of %s comes first", format_size(len(preview)))
     else:

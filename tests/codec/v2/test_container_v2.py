@@ -161,28 +161,12 @@ def test_damage_and_faults_of_a_preview_are_found(tmp_path: Path) -> None:
         verify(with_preview(tmp_path, moved))
     with pytest.raises(FormatError, match="sh_degree: wanted 0 or 2 in a preview, got 1"):
         verify(with_preview(tmp_path, make_grid(40, 1)))
+    small = tmp_path / "small.fgs"
+    with pytest.raises(FormatError, match="preview_bytes: wanted none in a preview"):
+        verify(with_preview(tmp_path, make_grid(40), preview=small.read_bytes()))
 
 
-def test_a_preview_may_have_one_that_has_none(tmp_path: Path) -> None:
-    inner = with_preview(tmp_path, make_grid(40)).read_bytes()
-    path, header, level = tmp_path / "b.fgs", GridContainer(tmp_path / "a.fgs").header, make_grid(900, 2)
-    write_grid(path, level, {}, chunk_rows=64, preview=inner)
-    verify(path)
-    assert Preview(Preview(GridContainer(path))).data == (tmp_path / "small.fgs").read_bytes()
-    for most in (len(inner), len(inner) - 1):
-        assert trim_container(path, tmp_path / "cut.fgs", most, force=True) <= most
-    assert (tmp_path / "cut.fgs").read_bytes() == (tmp_path / "small.fgs").read_bytes()
-    data, at = path.read_bytes(), GridContainer(path).header.preview.offset + header.preview.offset + 100
-    path.write_bytes(data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :])
-    assert [each.name for each in verify(path, raise_errors=False) if not each.ok] == ["preview"]
-    with pytest.raises(FormatError, match="preview_bytes: wanted none here"):
-        write_grid(
-            path, level, {}, preview=with_preview(tmp_path, make_grid(40), preview=inner).read_bytes(), force=True
-        )
-        verify(path)
-
-
-def test_levels_tell_no_boxes(tmp_path: Path) -> None:
+def test_boxes_can_be_left_out(tmp_path: Path) -> None:
     write_grid(tmp_path / "a.fgs", make_grid(900), {}, chunk_rows=64, boxes=False)
     assert GridContainer(tmp_path / "a.fgs").header.settings == {}
 

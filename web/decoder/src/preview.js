@@ -4,7 +4,7 @@ import { PREAMBLE_BYTES } from './limits.js';
 import { MemorySource } from './memory.js';
 
 /**
- * Open the preview of an opened file: the same scene in far fewer Gaussians. It may have one of its own. Null if there is none.
+ * Open the preview of an opened file: the same scene in far fewer Gaussians. Null if there is none.
  *
  * @param {FgsFile} file
  * @param {string} [name] of the file, for errors
@@ -13,20 +13,15 @@ import { MemorySource } from './memory.js';
 export async function openPreview(file, name = '') {
   const bytes = await file.previewBytes();
   if (!bytes.length) return null;
-  return openInside(new MemorySource(bytes), `${name} (preview)`, file);
-}
-
-/** Open the preview of a file from a source of its bytes. */
-export async function openInside(source, name, file) {
-  const small = await openRanged(source, name);
+  const inner = `${name} (preview)`;
+  const small = await openRanged(new MemorySource(bytes), inner);
   const fault = faultOf(small.header, file);
-  if (fault) throw new FgsError(name, PREAMBLE_BYTES, `header: ${fault}`);
-  small.inside = true;
+  if (fault) throw new FgsError(inner, PREAMBLE_BYTES, `header: ${fault}`);
   return small;
 }
 
 function faultOf({ previewBytes, origin, shDegree }, whole) {
-  if (previewBytes && whole.inside) return "preview_bytes: wanted none here";
+  if (previewBytes) return 'preview_bytes: wanted none in a preview';
   if (whole.origin.some((place, axis) => place !== origin[axis])) return `origin: wanted ${whole.origin}, got ${origin}`;
   if (shDegree === 0 || shDegree === whole.shDegree) return '';
   return `sh_degree: wanted 0 or ${whole.shDegree} in a preview, got ${shDegree}`;

@@ -15,6 +15,7 @@ export async function openRanged(source, name) {
 
 /** A file of which any chunk can be had. Each chunk is checked before it is decoded. */
 class RangedFile extends FgsFile {
+  #source;
   #name;
   #frame;
   #parts = null;
@@ -26,7 +27,7 @@ class RangedFile extends FgsFile {
       (options) => this.#inOrder(options),
       () => source.read(chunksOffset - previewBytes, previewBytes),
     );
-    this.source = source;
+    this.#source = source;
     this.#name = name;
     this.#frame = frame;
   }
@@ -40,16 +41,16 @@ class RangedFile extends FgsFile {
   async *#inOrder({ sh, layers, first }) {
     const parts = (await this.#places()).slice(first).filter(({ place }) => place.layer < layers);
     const last = parts.at(-1);
-    if (last) this.source.ahead?.(parts[0].offset, last.offset + last.length);
+    if (last) this.#source.ahead?.(parts[0].offset, last.offset + last.length);
     try {
       for (const part of parts) yield await this.#decoded(part, sh);
     } finally {
-      await this.source.cancel?.();
+      await this.#source.cancel?.();
     }
   }
 
   async #decoded({ place, offset, length, sum }, sh) {
-    const bytes = await this.source.read(offset, length);
+    const bytes = await this.#source.read(offset, length);
     return checkedChunk(this.#name, this.#frame, place, offset, length, sum, bytes, sh);
   }
 
@@ -64,7 +65,7 @@ class RangedFile extends FgsFile {
 
   async #readPlaces() {
     const { header, size, format } = this.#frame;
-    const table = await this.source.read(size - header.tableBytes, header.tableBytes);
+    const table = await this.#source.read(size - header.tableBytes, header.tableBytes);
     const { lengths, sums } = readTable(this.#name, this.#frame, table);
     let offset = header.chunksOffset;
     return Array.from(format.planChunks(header), (place) => {

@@ -4,7 +4,6 @@ import { createServer } from 'node:http';
 import { relative } from 'node:path';
 import { test } from 'node:test';
 import { fileURLToPath } from 'node:url';
-import { openLevels } from '../src/levels.js';
 import { FgsError, looksLikeFgs, open, openPreview, prefetch } from '../src/index.js';
 import { readAll, streamOf } from './read.mjs';
 
@@ -203,6 +202,7 @@ test('a preview comes before the chunks, and can be opened', async () => {
     assert.equal(rows, file.count);
   }
   assert.equal(await openPreview(await open(bytes)), null);
+  await assert.rejects(openPreview({ previewBytes: async () => previewed }), /preview_bytes: wanted none in a preview/);
 
   const { chunksOffset } = (await open(previewed)).header;
   await assert.rejects(open(streamOf(previewed.subarray(0, chunksOffset - 5), 100)), /preview: wanted .* truncated/);
@@ -212,21 +212,6 @@ test('a preview comes before the chunks, and can be opened', async () => {
   await assert.rejects(async () => {
     for await (const chunk of preview.chunks()) assert.ok(chunk);
   }, /a\.fgs \(preview\): byte \d+: /);
-});
-
-test('levels are read part by part, from a server, from bytes and from a stream', async () => {
-  const bytes = new Uint8Array(readFileSync(new URL('levels.fgs', FOLDER)));
-  for (const given of [bytes, streamOf(bytes, 100)]) {
-    const file = await open(given, { name: 'a.fgs' });
-    const [level, preview] = await openLevels(file, 'a.fgs');
-    assert.deepEqual([file.count, level.count, preview.count], [40, 16, 4]);
-    assert.deepEqual([level.layers.length, level.chunkCount, level.header.chunkRows], [4, 4, 16]);
-    const last = await level.chunk(3);
-    assert.equal(last.start + last.rows, 16);
-    assert.equal((await openPreview(file)).count, 16);
-    await assert.rejects(openPreview({ ...file, inside: true, previewBytes: file.previewBytes }), /wanted none here/);
-  }
-  assert.equal((await (await openPreview(await open(bytes))).chunk(3)).rows, (await openLevels(await open(bytes)))[0].layers[3]);
 });
 
 test('in Node: a path, a file address, a stream of its own', async () => {

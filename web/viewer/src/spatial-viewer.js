@@ -17,27 +17,16 @@ export class SpatialViewer extends PreviewViewer {
   }
 
   /** Most splats to hold: as the page's address says, or as many as there is graphics memory for. */
-  budgetOf({ shDegree }) {
-    const { count, shRows } = this.renderer.most(shDegree);
-    return Math.min(this.roomFor({ count: 1, shRows: 1, shDegree }), count, shDegree ? shRows : Infinity);
-  }
-
-  /** What is shown where chunks are missing. */
-  beside({ preview }) {
-    return new SpacePreview(this, this.space, preview);
-  }
-
-  /** What to ask the worker for next. */
-  nextPart() {
-    const part = this.space.next();
-    return part && { get: part.index, ...part.place };
+  #budget(degree) {
+    const { count, shRows } = this.renderer.most(degree);
+    return Math.min(this.roomFor({ count: 1, shRows: 1, shDegree: degree }), count, degree ? shRows : Infinity);
   }
 
   roomOf(header) {
     this.asking = 0;
     this.rested = false;
     this.spacePreview = null;
-    this.space = Space.tells(header) ? new Space(header, this.budgetOf(header)) : null;
+    this.space = Space.tells(header) ? new Space(header, this.#budget(header.shDegree)) : null;
     if (!this.space) {
       this.loader.postMessage({ all: true });
       return super.roomOf(header);
@@ -45,7 +34,7 @@ export class SpatialViewer extends PreviewViewer {
     const { room, share } = this.space;
     this.share = share;
     if (!header.preview) return room;
-    this.spacePreview = this.beside(header);
+    this.spacePreview = new SpacePreview(this, this.space, header.preview);
     this.loader.postMessage({ preview: true, start: room.count, shStart: room.shRows });
     return this.spacePreview.room;
   }
@@ -87,10 +76,10 @@ export class SpatialViewer extends PreviewViewer {
     if (!this.space || !this.header) return;
     this.space.look(this.view);
     while (this.asking < AT_ONCE) {
-      const part = this.nextPart();
+      const part = this.space.next();
       if (!part) break;
       this.asking++;
-      this.loader.postMessage(part);
+      this.loader.postMessage({ get: part.index, ...part.place });
     }
     if (this.asking || this.rested) return;
     this.rested = true;

@@ -347,7 +347,6 @@ export class Viewer extends EventTarget {
   }
 
   #sortIfNeeded() {
-    if (this.header) this.choose?.();
     const { camera, look, most } = this;
     const some = most < this.rows;
     const key = [...camera.depth, look.near, this.rows, some && [most, camera.eye]].join();

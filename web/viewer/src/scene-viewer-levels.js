@@ -1,3 +1,0 @@
-import { LevelViewer } from './level-viewer.js';
-
-export const SceneViewer = LevelViewer;
