@@ -9,6 +9,8 @@ import pytest
 
 from flexgs_edge.api.coding import compress
 from flexgs_edge.methods.best import preview
+from flexgs_edge.methods.best.grid_coder import projected_size, with_preview
+from flexgs_edge.run.options import CompressOptions
 from flexgs_edge.scene.source import Planes
 from tiny_project import make_project
 
@@ -32,3 +34,10 @@ def test_each_stage_leaves_so_many_times_the_rows_that_fit(tmp_path: Path, monke
     assert stages[0] / stages[-1] == pytest.approx(preview.STAGES[0] / preview.STAGES[-1])
     # The first stages go by the bits of the whole scene's rows. The last one goes by what a file took, with its headers.
     assert stages == pytest.approx([times * ends[0] for times in preview.STAGES], rel=0.75)
+
+
+@pytest.mark.parametrize(
+    ("asked", "size", "room"), [(None, 999_999, 0), (None, 2_000_000, 40_000), (0, 2_000_000, 0), (5000, 100, 5000)]
+)
+def test_a_size_leaves_room_for_the_preview(asked: int | None, size: int, room: int) -> None:
+    assert projected_size(CompressOptions(preview=asked), size) == size + with_preview(room)
