@@ -37,7 +37,6 @@ ROUNDS, BEST = 2, 20
 """So often the best views, so many in the same proportion, get others beside them, and half as many Gaussians that none of them
 shows well get places around them."""
 OWN_VIEWS = DEFAULT_HOLDOUT  # Views of each thing, if there are several: one of them decides
-MOST_THINGS = 50  # So many things at most have views of their own, the largest first
 OWN_PLACES, OWN_DISTANCE = 24, 2.3  # Places around a thing, so many half sides of its box away that it fills the frame
 AROUND = 0.5  # A thing lies around another if it is there on more than this share of all sides
 INNER_PLACES, INNER_SHARE = 8, 0.5  # Places inside what lies around others, so many half sides from its middle
@@ -111,7 +110,7 @@ def automatic_rig(
         least = min(max(LEAST_VIEWS, PIXELS * source.count // (width * height)), MOST_VIEWS)
         chosen = stage.in_order(stage.choose(views, least)) or [_blind(scene)] * (views or LEAST_VIEWS)
         if views is None:
-            numbers = range(len(scene.things))[:MOST_THINGS]
+            numbers = range(len(scene.things))[: MOST_VIEWS // OWN_VIEWS]
             chosen = _joined([chosen, *(_own_views(scene, number, stage) for number in numbers)])
         seen = list(stage.views) or chosen
         ups = stage.close_ups(chosen, CLOSE_UP_VIEWS) if stage.views and views is None else []

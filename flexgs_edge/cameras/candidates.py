@@ -12,7 +12,7 @@ from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_sh
 from flexgs_edge.cameras.scene_sample import SceneSample
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
 
-MOST_VIEWS = 1024
+MOST_VIEWS = 400
 SHOWN = 0.98
 """Views are enough when they show this share of all Gaussians that good views show, all together as well as the best of these."""
 SIDE = 80  # Pixels along the side of a candidate's picture, a square of the same area as the view

@@ -18,8 +18,6 @@ LEAST_STEPS = 240
 FINE_PASSES = 0.75  # Share of `Effort.passes` where poses have every pixel: docs/results/tuning.md#fine_passes
 MANY_POSES = 125
 """Beyond so many poses, steps of a descent grow with the root of their number: docs/results/tuning.md#many_poses"""
-VIEWED = 1 << 22
-"""Gaussians that `Effort.views` poses tell of; larger scenes get more in proportion: docs/results/tuning.md#viewed"""
 LEAST_VIEWS = 6
 """Least poses for a step of the refit. Steps from fewer poses overfit the scored poses, and all others get worse:
 docs/results/tuning.md#least_views"""
@@ -68,11 +66,7 @@ class Effort:
     def poses_of(self, pixels: Sequence[int], count: int) -> int:
         """How many poses to score for `count` Gaussians; `pixels` are those of each pose, in order."""
         enough = int(np.searchsorted(np.cumsum(pixels), self.pixels * count)) + 1
-        return min(max(self.few, enough), self.most_poses(count), len(pixels))
-
-    def most_poses(self, count: int) -> int:
-        """Most scored poses for `count` Gaussians."""
-        return round(self.views * max(count / VIEWED, 1.0))
+        return min(max(self.few, enough), self.views, len(pixels))
 
     def subsets_of(self, poses: int) -> int:
         """Steps of a round for `poses` scored poses."""

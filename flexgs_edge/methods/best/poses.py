@@ -266,15 +266,13 @@ def scored_poses(
     """
     plan = EFFORTS[options.effort]
     positions = some_positions(source)
-    most = plan.most_poses(source.count)
-    order = covering_order(cameras, positions, renderer.near, most)
+    order = covering_order(cameras, positions, renderer.near, plan.views)
     rest = sorted(set(range(len(cameras))) - set(order))
     ordered = [cameras[i] for i in (*order, *rest)]
     fine = is_fine(options, source)
     # Without photos, poses are chosen for what they add: all are needed.
     pixels = [camera.width * camera.height for camera in ordered]
-    if not (fine or covered_decides):
-        most = plan.poses_of(pixels, source.count)
+    most = plan.views if fine or covered_decides else plan.poses_of(pixels, source.count)
     chosen, given = ordered[:most], {id(camera) for camera in cameras}
     if options.makes_poses:
         scored = [*chosen, *margin_of(renderer, source, chosen, cameras)]
