@@ -12,7 +12,7 @@ from flexgs_edge.codec.v2.header import PREVIEW_KEY
 from flexgs_edge.grid.grid_scene import GridScene
 from flexgs_edge.memory.process import trim_heap
 from flexgs_edge.methods.best.allocation import BitModel
-from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE
+from flexgs_edge.methods.best.preview import default_bytes
 from flexgs_edge.render.renderer import Renderer
 from flexgs_edge.run.decoding import coding_device
 from flexgs_edge.run.options import CompressOptions
@@ -24,10 +24,8 @@ def projected_size(options: CompressOptions, size: int) -> int:
     Layers cost at most 6 %, since neighbours on the curve are farther apart in a layered file:
     docs/results/tuning.md#layers_cost
     """
-    cost, preview = 1.0 if options.layers in (None, 1) else 1.06, options.preview
-    if preview is None:
-        preview = int(PREVIEW_SHARE * size) if size >= LEAST_PREVIEWED else 0
-    return round(cost * size) + with_preview(preview)
+    cost = 1.0 if options.layers in (None, 1) else 1.06
+    return round(cost * size) + with_preview(default_bytes(size) if options.preview is None else options.preview)
 
 
 def with_preview(size: int) -> int:

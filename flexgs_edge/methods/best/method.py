@@ -30,7 +30,7 @@ from flexgs_edge.methods.best.layers import assign_layers, can_sort
 from flexgs_edge.methods.best.memory_plan import MemoryPlan, choose_storage
 from flexgs_edge.methods.best.memory_plan import expected_bytes as expected_bytes
 from flexgs_edge.methods.best.poses import ScoredPoses, scored_poses
-from flexgs_edge.methods.best.preview import LEAST_PREVIEWED, PREVIEW_SHARE, make_preview
+from flexgs_edge.methods.best.preview import default_bytes, make_preview
 from flexgs_edge.methods.best.rounds import PruneRounds
 from flexgs_edge.methods.best.search import Candidate, Maker, Product, search, search_size
 from flexgs_edge.progress import LOG
@@ -124,8 +124,7 @@ def _preview(
     """The preview that was asked for, or the one that a large file has by default."""
     most, limit, size = run.options.preview, run.target.limit_bytes, coder.size(grid, settings)
     if most is None:
-        large = size >= LEAST_PREVIEWED and can_sort(grid.count, run.source.count)
-        most = int(PREVIEW_SHARE * size) if large else 0
+        most = default_bytes(size) if can_sort(grid.count, run.source.count) else 0
         if limit is not None and size + with_preview(most) > limit:
             return b""
     if not most:

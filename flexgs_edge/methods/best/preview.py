@@ -46,6 +46,11 @@ TRIES, LESS = 3, 0.97
 """How often the last stage is made, each time with fewer Gaussians, until the size holds; and a margin for that."""
 
 
+def default_bytes(size: int) -> int:
+    """Bytes of the preview that a file of `size` bytes has where nothing is said; 0 for none."""
+    return int(PREVIEW_SHARE * size) if size >= LEAST_PREVIEWED else 0
+
+
 def make_preview(
     grid: GridScene,  # the whole scene
     most: int,  # bytes of the preview

@@ -155,9 +155,8 @@ def search_size(
     try:
         maker = fine()
         found, other = search(maker, target, tried=1, best_effort=True, on_step=on_step), first
-        # Whatever fits: a miss is landed later. What a result loses tells which kind is better.
-        one, two = (by_quality(target, result.chosen.measurement) for result in (found, first))
-        if one >= two:
+        # What they lose decides, also of one that is too large: it can lose Gaussians later.
+        if by_quality(target, first.chosen.measurement) <= by_quality(target, found.chosen.measurement):
             del maker
             maker, found, other = plain(), first, found
             maker.probe(maker.start(target), target)  # as the search before began: step sizes depend on what stays then

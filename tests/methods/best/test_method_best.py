@@ -278,9 +278,9 @@ def test_layers_are_the_same_scene_and_worth_most_first(project: Path, tmp_path:
 
 @pytest.mark.parametrize(
     ("least", "most", "limit", "there"),
-    [(10**9, 10**9, 0, False), (0, 10**9, 0, True), (0, 10**9, 1, False), (0, 9, 0, False)],
+    [(10**9, 10**9, 0, False), (0, 10**9, 0, True), (0, 10**9, 1, True), (0, 9, 0, False)],
 )
-def test_large_files_have_a_preview_where_it_fits(
+def test_large_files_have_a_preview_for_which_a_size_leaves_room(
     tiny: tuple[Path, CompressResult],
     project: Path,
     tmp_path: Path,
@@ -290,11 +290,11 @@ def test_large_files_have_a_preview_where_it_fits(
     limit: int,
     there: bool,
 ) -> None:
-    monkeypatch.setattr("flexgs_edge.methods.best.method.LEAST_PREVIEWED", least)
-    monkeypatch.setattr("flexgs_edge.methods.best.method.PREVIEW_SHARE", 0.4)  # of a file this small, 2 % hold nothing
+    monkeypatch.setattr("flexgs_edge.methods.best.preview.LEAST_PREVIEWED", least)
+    monkeypatch.setattr("flexgs_edge.methods.best.preview.PREVIEW_SHARE", 0.4)  # of a file this small, 2 % hold nothing
     monkeypatch.setattr("flexgs_edge.methods.best.layers.MOST_SORTED", most)
     monkeypatch.setattr("flexgs_edge.methods.best.layers.SORTED_ROW_BYTES", 10**3)
-    # As it is, the file fits by a few bytes, which a preview would not.
+    # Without a preview, the file would fit by a few bytes.
     target = {"max_size": tiny[1].size + 20} if limit else {"max_drop": 1.0}
     result = compress(
         tiny[0] if limit else project / "point_cloud.ply",
@@ -302,7 +302,7 @@ def test_large_files_have_a_preview_where_it_fits(
         **{**TINY, **target, "cameras": str(project / "cameras.json"), "images": str(project / "images")},
     )
     preview = info(tmp_path / "a.fgs").preview
-    assert (preview is not None) is there
+    assert (preview is not None) is there and (not limit or result.size <= tiny[1].size + 20)
     if preview is not None:
         assert 0 < preview["rows"] < result.count and preview["bytes"] <= 0.4 * result.size
 
