@@ -97,7 +97,9 @@ class Stage:
         scene, frames = self.scene, self.frames
         lines, distance = _lines(scene.means, eye)
         bins = bins_of(lines)
-        amounts = np.rint(UNITS * _close(scene.sizes / distance) * scene.stands / float(scene.stands.max()))
+        amounts = np.rint(
+            UNITS * _close(np.log(scene.sizes / distance)) * scene.stands / float(scene.stands.max())
+        )
         sums, sides = frames.sums(bins, amounts), filled_share(bins)
         most = float(sums.max())
         for _ in range(LINES):
@@ -106,7 +108,8 @@ class Stage:
                 break
             line = frames.directions[best]
             if sides < 0.5:
-                line = _middle(lines, amounts * frames.holds(line, lines), line)
+                held = np.flatnonzero(frames.holds(line, lines))
+                line = _middle(lines.take(held, axis=1), amounts[held], line)
             self._draw(eye, line, step, sides)
             sums[_along(line, frames.directions.T) > TURNED] = 0
 
@@ -129,7 +132,7 @@ class Stage:
         for view, worth in zip(self.views, self._worth() if self.views else ()):
             if worth:
                 best[view.rows] = np.maximum(best[view.rows], view.close)
-        missing = np.flatnonzero(best < _close(np.array([LEAST_ANGLE]))[0])
+        missing = np.flatnonzero(best < _close(np.log([LEAST_ANGLE]))[0])
         self._add_views_of(missing, count)
 
     def add_view(self, eye: np.ndarray, line: np.ndarray, step: float) -> None:
@@ -148,24 +151,25 @@ class Stage:
         total = float(light.sum())
         if not total:
             return
-        _, distance = _lines(scene.means[:, rows], eye)
+        distance, stands = _distances(scene.means.take(rows, axis=1), eye), scene.stands[rows]
         angles = scene.sizes[rows] / distance
-        logs, blurs = (np.rint(np.log(np.maximum(values, 1e-300)) * LOGS) for values in (distance, angles))
+        log_angles = np.log(np.maximum(angles, 1e-300))
+        logs, blurs = np.rint(np.log(distance) * LOGS), np.rint(log_angles * LOGS)
         usual = float((light * logs).sum()) / total
         before = float(light[(angles > WIDE) & (logs < usual + math.log(NEAR) * LOGS)].sum()) / total
         blur = float((light * blurs).sum()) / total / LOGS
         filled = min(total / LOGS / SIDE**2, 1.0)
         # Pictures show splats wider than they are: tiny ones would seem large from far away.
-        pixels = (self._focal * angles) ** 2 * scene.stands[rows]
+        pixels = (self._focal * angles) ** 2 * stands
         part = weights * np.minimum(distance, 1e100) ** 2 * (pixels / (pixels + DILATION))
-        np.maximum.at(self._most, rows, part)
+        self._most[rows] = np.maximum(self._most[rows], part)
         clear = (1 - before) ** NEAR_POWER * math.exp(-min((math.exp(min(blur, 50.0)) / BLURRED) ** 2, 600.0))
         clear *= min(filled / FILLED, 1.0) ** FILLED_POWER * max(0.5, sides) ** ENCLOSED_POWER
         smear = float((light * scene.smear[rows]).sum()) / total / LOGS
         self.views.append(
             Candidate(
-                eye, line, step, sides, rows, part, _close(angles), clear * self._told(eye, rows, part), smear, blur, filled,
-                math.exp(usual / LOGS), float(light[scene.stands[rows] > 0].sum()) / total,
+                eye, line, step, sides, rows, part, _close(log_angles), clear * self._told(eye, rows, part), smear, blur,
+                filled, math.exp(usual / LOGS), float(light[stands > 0].sum()) / total,
             )
         )  # fmt: skip
 
@@ -204,10 +208,9 @@ class Stage:
             return []
         scene, worth = self.scene, self._worth()
         self.worth = worth
-        merits = [
-            np.rint(1024 * view.part * view.close / np.maximum(self._most[view.rows], 1e-300)) for view in self.views
-        ]
-        shows = [float((merit * np.rint(scene.stands[view.rows])).sum()) for merit, view in zip(merits, self.views)]
+        largest, stands = np.maximum(self._most, 1e-300), np.rint(scene.stands)
+        merits = [np.rint(1024 * view.part * view.close / largest[view.rows]) for view in self.views]
+        shows = [float((merit * stands[view.rows]).sum()) for merit, view in zip(merits, self.views)]
         self.strength = worth * np.array(shows)
         fullest, most = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
         for view, merit, each, last in zip(self.views, merits, worth, self.last):
@@ -301,7 +304,7 @@ class Stage:
 
         def shown(view: Candidate) -> tuple[np.ndarray, np.ndarray]:
             rows = view.rows[2 * view.part >= np.maximum(self._most[view.rows], 1e-300)]
-            return rows, scene.sizes[rows] / _lines(scene.means[:, rows], view.at)[1]
+            return rows, scene.sizes[rows] / _distances(scene.means.take(rows, axis=1), view.at)
 
         for rows, angles in map(shown, chosen):
             seen[rows] = np.maximum(seen[rows], angles)
@@ -350,14 +353,18 @@ class ThingStage(Stage):
 
 def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors ([3, n]) and distances ([n]) from `eye` ([3]) to `means` ([3, n])."""
-    lines = means - eye[:, None]
-    distance = np.maximum(np.sqrt((lines * lines).sum(axis=0)), 1e-200)
-    return lines / distance, distance
+    distance = _distances(means, eye)
+    return (means - eye[:, None]) / distance, distance
 
 
-def _close(angles: np.ndarray) -> np.ndarray:
-    """[n] f64, 0 to 1, how well deviations over distances suit a view."""
-    off = (np.log(np.maximum(angles, 1e-300)) - math.log(SHARP)) / SHARP_SPREAD
+def _distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    x, y, z = (row - place for row, place in zip(means, eye))
+    return np.maximum(np.sqrt(x * x + y * y + z * z), 1e-200)
+
+
+def _close(log_angles: np.ndarray) -> np.ndarray:
+    """[n] f64, 0 to 1, how well deviations over distances suit a view, from the logs of these angles."""
+    off = (log_angles - math.log(SHARP)) / SHARP_SPREAD
     return np.exp(-0.5 * np.minimum(off * off, 1000.0))
 
 

@@ -19,8 +19,12 @@ def fibonacci(count: int) -> np.ndarray:
 def bins_of(lines: np.ndarray) -> np.ndarray:
     """[...] int64, the bin of each direction ([3, ...], any length): one of 6 faces of a cube, and a square of it."""
     x, y, z = np.abs(lines)
-    axis = np.where((x >= y) & (x >= z), 0, np.where(y >= z, 1, 2))
-    major, first, second = (np.choose((axis + turn) % 3, lines) for turn in range(3))
+    along_x, along_y = (x >= y) & (x >= z), y >= z
+    # Several times as fast as `choose`.
+    axis, major, first, second = (
+        np.where(along_x, parts[0], np.where(along_y, parts[1], parts[2]))
+        for parts in ((0, 1, 2), lines, np.roll(lines, -1, axis=0), np.roll(lines, 1, axis=0))
+    )
     size = np.maximum(np.abs(major), 1e-300)
     row, column = (np.minimum((part / size + 1) * (FACE / 2), FACE - 1).astype(np.int64) for part in (first, second))
     return ((axis * 2 + (major < 0)) * FACE + row) * FACE + column

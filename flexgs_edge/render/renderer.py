@@ -164,13 +164,23 @@ class Renderer(AbstractContextManager["Renderer"]):
 
     def add_statistics(self, scene: DeviceScene, camera: Camera, statistics: Statistics) -> None:
         """Add the hits and weights of every row in one view to `statistics`."""
+        hits, weights, rows = self._statistics(scene, camera)
+        statistics.hits[rows] += self.backend.read(hits, np.empty(weights.size, np.uint32))
+        statistics.weights[rows] += weights
+
+    def shown_weights(self, scene: DeviceScene, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """The rows that contribute to a view ([m] i64, ascending), and their weights in it ([m] u64), as in `Statistics`."""
+        _, weights, rows = self._statistics(scene, camera)
+        some = np.flatnonzero(weights)
+        return some if isinstance(rows, slice) else rows[some].astype(np.int64), weights[some]
+
+    def _statistics(self, scene: DeviceScene, camera: Camera) -> tuple[Any, np.ndarray, Any]:
+        """Hits in a view on the backend, weights there, and the rows that they belong to."""
         view = self._prepare(scene, camera)
         hits, sums = self._sum_arrays(scene, view, 1)
         self._blend(view, "blend_stats", (hits, sums))
         found = self.view_rows
-        rows = slice(None) if found is None else found
-        statistics.hits[rows] += self.backend.read(hits, np.empty(view.count, np.uint32))
-        statistics.weights[rows] += self._reader.first_plane(sums, view.count)
+        return hits, self._reader.first_plane(sums, view.count), slice(None) if found is None else found
 
     def removal_sums(self, scene: DeviceScene, camera: Camera) -> Any:
         """Squared error of removing each row alone, and the sum of its squared weights, in one view.

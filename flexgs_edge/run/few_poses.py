@@ -12,7 +12,6 @@ from flexgs_edge.quality.psnr import mse
 from flexgs_edge.quality.view_quality import Quality, ViewQuality
 from flexgs_edge.render.device_scene import DeviceScene
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.scene.source import SceneSource, without_degrees
 from flexgs_edge.small_matrices import product
 from flexgs_edge.views.references import References
@@ -109,13 +108,11 @@ def visible_depths(renderer: Renderer, source: SceneSource, cameras: Sequence[Ca
     depths = []
     with renderer.load(without_degrees(source, 0)) as scene:
         for camera in map(middle_of, cameras):
-            statistics = Statistics.zeros(source.count)
-            renderer.add_statistics(scene, camera, statistics)
-            rows = np.flatnonzero(statistics.weights)
+            rows, weights = renderer.shown_weights(scene, camera)
             moved = camera.moved(source.origin)
-            depth = product(moved.rotation[2:], means[:, rows].astype(np.float64))[0] + moved.translation[2]
+            depth = product(moved.rotation[2:], means.take(rows, axis=1).astype(np.float64))[0] + moved.translation[2]
             order = np.argsort(depth, kind="stable")
-            light = np.cumsum(statistics.weights[rows][order])
+            light = np.cumsum(weights[order])
             depths.append(float(depth[order[np.searchsorted(light, light[-1] // 2)]]) if len(rows) else np.nan)
     renderer.release()
     known = [depth for depth in depths if depth == depth]

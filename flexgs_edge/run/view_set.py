@@ -16,7 +16,7 @@ from flexgs_edge.cameras.photos import Photos
 from flexgs_edge.cameras.read import read_cameras
 from flexgs_edge.cameras.scene_sample import READ_ROWS
 from flexgs_edge.cameras.start import StartView, start_view
-from flexgs_edge.constants import SH_C0
+from flexgs_edge.constants import FIXED_WEIGHT, SH_C0
 from flexgs_edge.errors import InputError
 from flexgs_edge.io.model_folder import Companions
 from flexgs_edge.kernels.backend import Backend
@@ -24,7 +24,6 @@ from flexgs_edge.kernels.tested import counted_backend
 from flexgs_edge.memory.budget import MemoryBudget
 from flexgs_edge.progress import LOG, Stopwatch
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.report.run_info import ViewsInfo
 from flexgs_edge.run.inputs import Options
 from flexgs_edge.run.options import AUTO_CAMERAS, NO_CAMERAS, NO_PHOTOS, ViewOptions
@@ -246,10 +245,8 @@ def sketch(backend: Backend, budget: MemoryBudget, planes: dict[str, np.ndarray]
     with renderer.load(source) as scene:
 
         def show(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-            statistics = Statistics.zeros(source.count)
-            renderer.add_statistics(scene, camera, statistics)
-            rows = np.flatnonzero(statistics.weights)
-            return rows, statistics.weight_sums[rows]
+            rows, weights = renderer.shown_weights(scene, camera)
+            return rows, weights / FIXED_WEIGHT
 
         yield show
     renderer.release()
