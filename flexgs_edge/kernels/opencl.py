@@ -231,7 +231,7 @@ class OpenCLBackend:
         """Enqueue `kernel`; with `profile` set, also wait for it, and add its wall seconds under `label`."""
         start = time.perf_counter() if self.profile is not None else 0.0
         try:
-            kernel(self.queue, size, local, *(a.buffer if isinstance(a, DeviceArray) else a for a in args))
+            kernel(self.queue, size, local, *[a.buffer if type(a) is DeviceArray else a for a in args])
         except cl.Error as error:
             raise self._failure(f"running kernel {label}", error) from error
         if self.profile is not None:

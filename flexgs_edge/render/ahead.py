@@ -34,20 +34,17 @@ def camera_record(camera: Camera, origin: np.ndarray, near: float) -> np.ndarray
     `camera`: in world coordinates. `origin`: [3] f64, the world point that the scene is centred at. `near`: near plane,
     scene units. Returns [32] f32.
     """
-    moved = camera.moved(origin)
-    x_low = -(moved.cx + 0.5) / moved.fx - JACOBIAN_MARGIN * moved.width / moved.fx
-    x_high = (moved.width - 0.5 - moved.cx) / moved.fx + JACOBIAN_MARGIN * moved.width / moved.fx
-    y_low = -(moved.cy + 0.5) / moved.fy - JACOBIAN_MARGIN * moved.height / moved.fy
-    y_high = (moved.height - 0.5 - moved.cy) / moved.fy + JACOBIAN_MARGIN * moved.height / moved.fy
+    x_low = -(camera.cx + 0.5) / camera.fx - JACOBIAN_MARGIN * camera.width / camera.fx
+    x_high = (camera.width - 0.5 - camera.cx) / camera.fx + JACOBIAN_MARGIN * camera.width / camera.fx
+    y_low = -(camera.cy + 0.5) / camera.fy - JACOBIAN_MARGIN * camera.height / camera.fy
+    y_high = (camera.height - 0.5 - camera.cy) / camera.fy + JACOBIAN_MARGIN * camera.height / camera.fy
     record = np.zeros(32)
-    record[0:9] = moved.rotation.reshape(-1)
-    record[9:12] = moved.translation
-    record[12:16] = moved.fx, moved.fy, moved.cx, moved.cy
+    record[0:9] = camera.rotation.reshape(-1)
+    record[9:12] = shift = camera.translation + product(camera.rotation, origin)
+    record[12:16] = camera.fx, camera.fy, camera.cx, camera.cy
     record[16:21] = near, x_low, x_high, y_low, y_high
-    record[21:24] = product(
-        -moved.rotation.T, moved.translation
-    )  # the transpose as inverse is exact enough near the origin
-    record[24:27] = moved.width, moved.height, moved.dilation
+    record[21:24] = product(-camera.rotation.T, shift)  # the transpose as inverse is exact enough near the origin
+    record[24:27] = camera.width, camera.height, camera.dilation
     return record.astype(np.float32)
 
 

@@ -246,7 +246,7 @@ class DeviceScene(AbstractContextManager["DeviceScene"]):
     @property
     def blocks(self) -> int:
         """Blocks of all chunks."""
-        return int((-(-np.diff(self.starts) // ROW_BLOCK)).sum())
+        return sum(-(-(stop - start) // ROW_BLOCK) for start, stop, _ in self.spans())
 
     @property
     def starts(self) -> np.ndarray:

@@ -248,7 +248,7 @@ class Renderer(AbstractContextManager["Renderer"]):
             # Only the blend of weights counts hits; the other blends leave this array alone.
             shapes = (((count if channels == 1 else 1,), np.uint32), ((count, channels, 2), np.uint32))
             held = scene.statistics = [self.backend.array(shape, dtype) for shape, dtype in shapes]
-        for array in held:
+        for array in held if channels == 1 else held[1:]:
             self.backend.fill(array, 0, min(view.count, array.shape[0]))
         return held[0], held[1]
 
