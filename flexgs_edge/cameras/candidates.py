@@ -11,6 +11,7 @@ from flexgs_edge.cameras.detail import UNITS as LOGS
 from flexgs_edge.cameras.directions import Frames, bins_of, fibonacci, filled_share
 from flexgs_edge.cameras.scene_sample import SceneSample
 from flexgs_edge.constants import DEFAULT_HOLDOUT, DILATION
+from flexgs_edge.small_matrices import cross
 
 MOST_VIEWS = 400
 SHOWN = 0.98
@@ -116,10 +117,10 @@ class Stage:
     def add_beside(self, view: Candidate) -> None:
         """Draw four views of the same: from two places beside, nearer and farther."""
         target = view.at + view.line * view.distance
-        across = np.cross(view.line, np.eye(3)[int(np.argmin(np.abs(view.line)))])
+        across = cross(view.line, np.eye(3)[int(np.argmin(np.abs(view.line)))])
         across /= _length(across)
         turn = 2.399963 * len(self.views)
-        aside = math.cos(turn) * across + math.sin(turn) * np.cross(view.line, across)
+        aside = math.cos(turn) * across + math.sin(turn) * cross(view.line, across)
         step = view.step / 2
         for move in (aside * step, -aside * step, 0.3 * view.line * view.distance, -0.4 * view.line * view.distance):
             eye = view.at + move
@@ -209,8 +210,14 @@ class Stage:
         scene, worth = self.scene, self._worth()
         self.worth = worth
         largest, stands = np.maximum(self._most, 1e-300), np.rint(scene.stands)
-        merits = [np.rint(1024 * view.part * view.close / largest[view.rows]) for view in self.views]
-        shows = [float((merit * stands[view.rows]).sum()) for merit, view in zip(merits, self.views)]
+        merits = [
+            np.rint(1024 * view.part * view.close / largest[view.rows]) if each or last else np.zeros(view.rows.size)
+            for view, each, last in zip(self.views, worth, self.last)
+        ]
+        shows = [
+            float((merit * stands[view.rows]).sum()) if each else 0.0
+            for merit, view, each in zip(merits, self.views, worth)
+        ]
         self.strength = worth * np.array(shows)
         fullest, most = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
         for view, merit, each, last in zip(self.views, merits, worth, self.last):
@@ -392,11 +399,11 @@ def look(
 ) -> Camera:
     """A camera at `position` that looks along `direction`; the top of the image points to `up` (all [3], world)."""
     forward = direction / _length(direction)
-    right = np.cross(forward, up)
+    right = cross(forward, up)
     if _length(right) < 1e-3:  # straight up or down: any roll will do
-        right = np.cross(forward, np.roll(up, 1))
+        right = cross(forward, np.roll(up, 1))
     right /= _length(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
+    rotation = np.stack([right, cross(forward, right), forward])
     shift = -(rotation * position).sum(axis=1)
     return Camera(name, width, height, rotation, shift, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
