@@ -98,9 +98,7 @@ class Stage:
         scene, frames = self.scene, self.frames
         lines, distance = _lines(scene.means, eye)
         bins = bins_of(lines)
-        amounts = np.rint(
-            UNITS * _close(np.log(scene.sizes / distance)) * scene.stands / float(scene.stands.max())
-        )
+        amounts = np.rint(UNITS * _close(np.log(scene.sizes / distance)) * scene.stands / float(scene.stands.max()))
         sums, sides = frames.sums(bins, amounts), filled_share(bins)
         most = float(sums.max())
         for _ in range(LINES):
@@ -214,10 +212,7 @@ class Stage:
             np.rint(1024 * view.part * view.close / largest[view.rows]) if each or last else np.zeros(view.rows.size)
             for view, each, last in zip(self.views, worth, self.last)
         ]
-        shows = [
-            float((merit * stands[view.rows]).sum()) if each else 0.0
-            for merit, view, each in zip(merits, self.views, worth)
-        ]
+        shows = [float((merit * stands[view.rows]).sum()) for merit, view in zip(merits, self.views)]
         self.strength = worth * np.array(shows)
         fullest, most = np.zeros(scene.sizes.size), np.zeros(scene.sizes.size)
         for view, merit, each, last in zip(self.views, merits, worth, self.last):

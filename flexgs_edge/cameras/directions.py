@@ -23,8 +23,7 @@ def bins_of(lines: np.ndarray) -> np.ndarray:
     x, y, z = lines
     # Several times as fast as `choose`.
     axis, major, first, second = (
-        np.where(along_x, parts[0], np.where(along_y, parts[1], parts[2]))
-        for parts in ((0, 1, 2), (x, y, z), (y, z, x), (z, x, y))
+        np.where(along_x, a, np.where(along_y, b, c)) for a, b, c in ((0, 1, 2), (x, y, z), (y, z, x), (z, x, y))
     )
     size = np.maximum(np.abs(major), 1e-300)
     row, column = (np.minimum((part / size + 1) * (FACE / 2), FACE - 1).astype(np.int64) for part in (first, second))

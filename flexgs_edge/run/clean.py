@@ -21,7 +21,6 @@ from flexgs_edge.io.ply import write_ply
 from flexgs_edge.progress import LOG, SILENT, Progress
 from flexgs_edge.quality.psnr import exposure_gains, mse_of_psnr, with_gains
 from flexgs_edge.render.renderer import Renderer
-from flexgs_edge.render.statistics import Statistics
 from flexgs_edge.report.run_info import RemovedGroup
 from flexgs_edge.run.options import GENTLE, CompressOptions
 from flexgs_edge.run.quality_evaluator import QualityEvaluator
@@ -201,11 +200,7 @@ def _show(run: Run[CompressOptions], renderer: Renderer, reporter: Reporter, gon
     source, cameras = run.source, run.seen.of(run.plan.report)
     kept, removed = (SelectSource(source, np.flatnonzero(which)) for which in (~gone, gone))
     with renderer.load(removed) as scene:
-        shown = []
-        for camera in cameras:
-            statistics = Statistics.zeros(removed.count)
-            renderer.add_statistics(scene, camera, statistics)
-            shown.append(float(statistics.weight_sums.sum()))
+        shown = [float(renderer.shown_weights(scene, camera)[1].sum()) for camera in cameras]
     camera, images = cameras[int(np.argmax(shown))], []
     for part in (source, kept, removed):
         with renderer.load(part) as scene:

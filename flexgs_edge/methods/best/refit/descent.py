@@ -129,19 +129,9 @@ class ChunkState:
 
     def snap(self, steps: Any) -> None:
         """Put the values on a grid (record of `step_record`), for drawing."""
-        chunk, stride = self.chunk, self.chunk.stride
-        self.backend.launch(
-            "snap",
-            (stride,),
-            stride,
-            chunk.degree,
-            steps,
-            self.values,
-            chunk.means,
-            *self.stored,
-            chunk.sh_dc,
-            chunk.sh_rest,
-        )
+        chunk, size = self.chunk, (self.chunk.stride,)
+        planes = self.values, chunk.means, *self.stored, chunk.sh_dc, chunk.sh_rest
+        self.backend.launch("snap", size, chunk.stride, chunk.degree, steps, *planes)
 
     def activate(self) -> None:
         """Compute what else views are drawn from, after `snap`."""
@@ -258,10 +248,8 @@ class Descent(AbstractContextManager["Descent"]):
         return self._arrays[-1]
 
     def _state(self, chunk: Chunk, planes: dict[str, np.ndarray], degrees: np.ndarray) -> ChunkState:
-        part, span = (
-            ChunkState(self.backend, chunk, self._scene.antialiased),
-            slice(chunk.base, chunk.base + chunk.count),
-        )
+        part = ChunkState(self.backend, chunk, self._scene.antialiased)
+        span = slice(chunk.base, chunk.base + chunk.count)
         self.backend.fill(part.values, 0)
         part.begin()
         part.put_degrees(degrees[span])
