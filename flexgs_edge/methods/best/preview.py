@@ -44,7 +44,7 @@ COARSE = 2.0  # Step sizes of the preview's grid, as multiples of those of the w
 POSES, POINTS = 128, 1 << 14  # Most poses, and about the most points that are looked at in each of them
 TRIES, LESS = 3, 0.95
 """How often the last stage is made, each time with fewer Gaussians, until the size holds; and a margin, so that once is enough:
-the fewer Gaussians there are, the more bytes each takes, 1 to 5 % in a stage."""
+the fewer Gaussians, the more bytes each takes, 1 to 5 % in a stage: docs/results/tuning.md#preview"""
 
 
 def default_bytes(size: int) -> int:
