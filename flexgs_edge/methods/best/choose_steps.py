@@ -29,6 +29,7 @@ GEOMETRY = {
 CHROMA = 2.0
 """Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
 So equal slopes ask for sqrt(6) and 2."""
+COARSEST = 2.0**70  # Largest step size: a size that hardly holds the header drives the multiplier far beyond all sense
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Slopes:
     def step(self, kind: str, multiplier: float) -> float:
         """The step size of `kind` for a multiplier."""
         slope = max(self.per_row[kind], 1e-30)
-        return math.sqrt(multiplier * GEOMETRY[kind][1] / (2 * math.log(2) * slope))
+        return min(math.sqrt(multiplier * GEOMETRY[kind][1] / (2 * math.log(2) * slope)), COARSEST)
 
 
 def probe_slopes(
@@ -113,7 +114,7 @@ def choose_steps(
     def colour(rows: np.ndarray) -> float:
         # Uniform error of variance d^2 / 12; the mean of Y_k^2 over directions is Y_0^2 for every k.
         slope = 3 * SH_C0**2 * max(float(rows.sum()), 1e-30) / 12
-        return math.sqrt(multiplier * max(len(rows), 1) / (2 * math.log(2) * slope))
+        return min(math.sqrt(multiplier * max(len(rows), 1) / (2 * math.log(2) * slope)), COARSEST)
 
     bands = tuple(colour(weight2[degrees >= max(level, 1)]) for level in range(1, sh_degree + 1))
     geometry: dict[str, Any] = {kind: slopes.step(kind, multiplier) for kind in GEOMETRY}

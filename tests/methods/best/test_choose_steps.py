@@ -36,6 +36,10 @@ def test_doubling_the_multiplier_scales_every_step_by_root_two() -> None:
     assert steps_at(1e-3).chroma == steps_at(2e-3).chroma > 1
 
 
+def test_multipliers_beyond_all_sense_give_steps_that_a_grid_can_have() -> None:
+    assert numbers(steps_at(1e60)).max() < 2.0**80
+
+
 def test_slopes_are_equal_at_the_chosen_steps() -> None:
     """With an error of slope s a row and squared step d^2 and bits of -n log2 d a row: the multiplier is dE / dbits."""
     multiplier = 1e-3
