@@ -21,8 +21,7 @@ docs/results/tuning.md#ssim_per_db"""
 LEAST_SSIM = 1e-4  # Least SSIM that a target allows to lose; rounding alone loses a part of it
 LOST_ALONE = 1.5  # A view that loses so many times the share of all other bounds needs more than finer steps
 MADE_GAP = 3.0
-"""Generated poses may have this much less fidelity than the target leaves to the views that decide, dB: twice the squared
-error."""
+"""Generated poses may have this much less fidelity than the views that decide, dB: twice their squared error."""
 
 
 class Part(ABC):
@@ -108,21 +107,20 @@ class MeanSsim(Part):
 
 @dataclass(frozen=True)
 class MadePoses(Part):
-    """Generated poses have at most `gap` dB less fidelity than the target leaves to the views that decide."""
+    """Generated poses have at most `gap` dB less fidelity than the views that decide."""
 
-    target: Target
     gap: float = MADE_GAP
     name = "made poses"
     option = "--no-views-margin"
 
     def found(self, measurement: Measurement) -> float | None:
-        return measurement.made_gap(self.target.spare(measurement))
+        return measurement.made_gap
 
     def allowed(self, measurement: Measurement) -> float:
         return self.gap
 
     def report(self, measurement: Measurement) -> str:
-        found = self.found(measurement)
+        found = measurement.made_gap
         return f"made poses {'-' if found is None else f'{found:.2f}'} of {self.gap:g} dB less fidelity"
 
 
@@ -145,9 +143,6 @@ class Promised:
     def limit_bytes(self) -> int | None:
         """The size limit of the target."""
         return self.target.limit_bytes
-
-    def spare(self, measurement: Measurement) -> float:
-        return self.target.spare(measurement)
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         own = self.target.excess(size, measurement)

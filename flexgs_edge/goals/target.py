@@ -15,7 +15,6 @@ Figure = Literal["drop", "modelled drop", "fidelity"]
 """The figure that decides: drop against photos, modelled drop, or fidelity (PSNR against the original's renders)."""
 
 IDENTICAL_DB = 200.0  # Fidelity of identical renders in comparisons; it is never reported
-ALIKE = 48.0  # Fidelity in dB from which on more of it shows nothing: an error of one level of 255
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Measurement:
     # Mean over the views of the drop that decides, where a view that gains counts as 0; `None` if not known.
     usual: float | None = None
     ssim_drop: float | None = None  # SSIM lost, against photos or modelled; `None` if not measured
-    made: float | None = None  # fidelity at made poses, dB; `None` if not measured or identical
+    made_gap: float | None = None  # how much less fidelity made poses have, dB; `None` if not measured
     # Drop of each view that decides, dB, in their order; `None` for views with hardly any coverage.
     losses: tuple[float | None, ...] = ()
 
@@ -61,11 +60,6 @@ class Measurement:
             raise InputError("the drop against photos was asked to decide, but there are no photos")
         return value
 
-    def made_gap(self, spare: float = 0.0) -> float | None:
-        """How much less fidelity made poses have, dB, than views with `spare` less than measured, of at most `ALIKE`."""
-        own = self.figure("fidelity")
-        return None if own is None or self.made is None else min(own - spare, ALIKE) - self.made
-
 
 class Target(Protocol):
     """A target, as searches use it."""
@@ -79,9 +73,6 @@ class Target(Protocol):
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         """By how much a point misses; zero or less holds."""
-
-    def spare(self, measurement: Measurement) -> float:
-        """How much fidelity, dB, the views that decide could still lose until the target hardly holds; 0 if it misses."""
 
     def describe(self) -> str:
         """The target in words, for the summary and for messages."""
@@ -105,11 +96,6 @@ class MaxDrop:
     def excess(self, size: int, measurement: Measurement | None) -> float:
         assert measurement is not None
         return log_loss(measurement.loss(self.figure), self.limit)
-
-    def spare(self, measurement: Measurement) -> float:
-        # A drop of d dB is a squared error that grew to 10^(d / 10) times the original's own.
-        added, allowed = (10.0 ** (drop / 10.0) - 1.0 for drop in (measurement.loss(self.figure), self.limit))
-        return max(-log_loss(added, allowed) * 10.0 / math.log(10.0), 0.0)
 
     def describe(self) -> str:
         return f"{self.figure} <= {self.limit:g} dB"
@@ -146,9 +132,6 @@ class MinFidelity:
         assert measurement is not None
         return (self.limit + measurement.loss("fidelity")) * (math.log(10.0) / 10.0)
 
-    def spare(self, measurement: Measurement) -> float:
-        return max(-measurement.loss("fidelity") - self.limit, 0.0)
-
     def describe(self) -> str:
         return f"fidelity >= {self.limit:g} dB"
 
@@ -173,9 +156,6 @@ class MaxSize:
 
     def excess(self, size: int, measurement: Measurement | None) -> float:
         return math.log(size / self.limit_bytes)
-
-    def spare(self, measurement: Measurement) -> float:
-        return 0.0
 
     def describe(self) -> str:
         return self.words or f"size <= {format_size(self.limit_bytes)}"

@@ -20,6 +20,7 @@ Distance = Callable[[np.ndarray, np.ndarray], float | None]
 LEAST_COVERAGE = 0.1
 """The worst view by covered figures has at least this share of the mean coverage. Views that see a few faint pixels have
 large errors relative to them, and nobody would see these."""
+ALIKE = 48.0  # Fidelity in dB from which on more of it shows nothing: an error of one level of 255
 Figures = Callable[[Sequence[tuple[np.ndarray, np.ndarray]]], Sequence[float | None]]
 """Figures of pairs of [H, W, 3] images, all of one size."""
 
@@ -196,6 +197,12 @@ class Quality:
             return None
         shared = 1.0 - self.ssim_original
         return modelled_ssim_drop(shared / (self.coverage or 1.0) if self.covered_decides else shared)
+
+    @property
+    def made_gap(self) -> float | None:
+        """How much less fidelity made poses have, dB, of at most `ALIKE`; `None` if they were not measured or are identical."""
+        own, made = self.deciding_fidelity, None if self.made is None else self.made.deciding_fidelity
+        return None if own is None or made is None else min(own, ALIKE) - made
 
     @property
     def identical(self) -> int:

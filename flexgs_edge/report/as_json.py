@@ -27,7 +27,7 @@ def step_json(step: Step) -> dict[str, Any]:
         "worst": _measured_json(found.worst) if found and found.worst else None,
         "usual_drop": rounded(found.usual if found else None),
         "ssim_drop": rounded(found.ssim_drop if found else None, 5),
-        "made_gap": rounded(found.made_gap() if found else None),
+        "made_gap": rounded(found.made_gap if found else None),
         "holds": step.holds,
         "estimated": step.estimated,
         "seconds": round(step.seconds, 3),

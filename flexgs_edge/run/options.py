@@ -328,9 +328,9 @@ class CompressOptions(ViewOptions):
         else:
             allowed = DEFAULT_MAX_DROP if self.max_drop is None else self.max_drop
             target = MaxDrop(allowed, figure)
-        return promised(target, self._parts(target, figure, allowed))
+        return promised(target, self._parts(figure, allowed))
 
-    def _parts(self, target: Target, figure: Figure, allowed: float | None) -> list[Part]:
+    def _parts(self, figure: Figure, allowed: float | None) -> list[Part]:
         """The bounds beside the target; `allowed` is the drop that the target allows, dB, if it says so."""
         parts: list[Part] = []
         whole = self.promise == "whole"
@@ -343,7 +343,7 @@ class CompressOptions(ViewOptions):
         elif whole and self.max_ssim_drop is None and allowed is not None:
             parts.append(MeanSsim(max(SSIM_PER_DB * allowed, LEAST_SSIM)))
         if self.makes_poses:
-            parts.append(MadePoses(target))
+            parts.append(MadePoses())
         return parts
 
     def bit_spec(self) -> tuple[BitSpec, int | None]:

@@ -337,7 +337,7 @@ def measurement_of(quality: Quality) -> Measurement:
         worst=alone,
         usual=quality.usual_drop,
         ssim_drop=quality.ssim_drop,
-        made=None if quality.made is None else quality.made.deciding_fidelity,
+        made_gap=quality.made_gap,
         losses=tuple(quality.losses),
     )
 
