@@ -360,6 +360,7 @@ def _lines(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _distances(means: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """[n] f64, as of `_lines`."""
     x, y, z = (row - place for row, place in zip(means, eye))
     return np.maximum(np.sqrt(x * x + y * y + z * z), 1e-200)
 

@@ -29,7 +29,8 @@ GEOMETRY = {
 CHROMA = 2.0
 """Step sizes of Co and Cg in step sizes of Y. The squared error in red, green and blue is 3 dY^2 + dCo^2 / 2 + 3/4 dCg^2.
 So equal slopes ask for sqrt(6) and 2."""
-COARSEST = 2.0**70  # Largest step size: a size that hardly holds the header drives the multiplier far beyond all sense
+COARSEST = 2.0**70
+"""Largest step size; the format ends at 2^80. A size that hardly holds the header asks for larger ones."""
 
 
 @dataclass(frozen=True)
